@@ -1,0 +1,72 @@
+"""Classical reconstructions in the project's frame, for comparison and quick looks.
+
+Each method is a function of a capture and a volume grid, ``method(capture, grid, **options) -> [nz, nx, ny]`` float32, nonnegative;
+``METHODS`` names them. Equations, options, sources and measured errors: ``docs/baselines.md``.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from nlos_lit.baselines.backprojection import bp, bp_bytes, fbp, fbp_bytes
+from nlos_lit.baselines.fk import fk, fk_bytes
+from nlos_lit.baselines.lct import lct, lct_bytes
+from nlos_lit.capture import Capture
+from nlos_lit.errors import MemoryBudgetError, UserError
+from nlos_lit.grid import VolumeGrid
+
+METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "fk": fk}
+_BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {"bp": bp_bytes, "fbp": fbp_bytes, "lct": lct_bytes, "fk": fk_bytes}
+
+
+def reconstruct(
+    capture: Capture, grid: VolumeGrid, method: str, *, budget_bytes: int | None = None, **options: Any
+) -> torch.Tensor:
+    """Runs one of ``METHODS``.
+
+    Args:
+        capture: what was measured.
+        grid: where to reconstruct.
+        method: a name in ``METHODS``.
+        budget_bytes: memory the method may allocate beyond the capture's counts; None sets no limit.
+        options: of that method, by name.
+
+    Returns:
+        ``[nz, nx, ny]`` float32, nonnegative.
+
+    Raises:
+        UserError: unknown method or option.
+        CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
+        MemoryBudgetError: the estimate is above the budget; nothing was allocated.
+    """
+    function = _known(method)
+    allowed = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    if unknown := sorted(set(options) - set(allowed)):
+        raise UserError(f"method {method} has no option {unknown[0]!r}; it takes {', '.join(allowed)}")
+    if budget_bytes is not None and (need := estimate_bytes(capture, grid, method)) > budget_bytes:
+        raise MemoryBudgetError(
+            f"method {method} needs {need / 2**30:.2f} GiB, above the budget of {budget_bytes / 2**30:.2f} GiB; "
+            f"sum time bins or spots of the capture, make the volume smaller, or raise the budget"
+        )
+    return function(capture, grid, **options)
+
+
+def estimate_bytes(capture: Capture, grid: VolumeGrid, method: str) -> int:
+    """Bytes that a method will allocate at its peak, beyond the capture's own counts; allocates nothing of that size.
+
+    Raises:
+        UserError: unknown method.
+        CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
+    """
+    _known(method)
+    return _BYTES[method](capture, grid)
+
+
+def _known(method: str) -> Callable[..., torch.Tensor]:
+    if method not in METHODS:
+        raise UserError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
+    return METHODS[method]

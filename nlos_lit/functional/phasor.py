@@ -1,0 +1,217 @@
+"""Phasor-field imaging, Eq. 1-2 at t = 0: virtual illumination and Rayleigh-Sommerfeld propagation.
+
+The field at a voxel is ``u(x_v) = Σ_f w_f(Ω_pf, σ_pf) A_f(x_v)``. Only the weights ``w`` depend on what is optimised, so the
+propagated field ``A`` is computed once. The weights of all admissible (Ω_pf, σ_pf) span far fewer dimensions than there are
+frequencies (a virtual pulse of a few σ_pf is short against the transient), so ``A`` is stored in an orthonormal basis of that
+span: ``u = Σ_r (Bᵀw)_r (A B)_r``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+
+def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> Tensor:
+    """Spectrum of ``P(t) = e^{iΩ_pf t} e^{-t²/(2σ_pf²)}`` at frequencies ``omega`` ``[F]`` rad/m, scaled to a unit peak."""
+    return torch.exp(-0.5 * ((omega - omega_pf) * sigma_pf) ** 2)
+
+
+def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
+    """``U[f, s] = Σ_t H[s, t] e^{iΩ_f t}``; counts ``[S, T]``, time of bin centres ``[T]`` m, omega ``[F]`` rad/m."""
+    phase = omega.double()[:, None] * time.double()
+    kernel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64).to(counts.device)
+    real = counts.to(torch.float32).T.contiguous()
+    return torch.complex(kernel.real @ real, kernel.imag @ real)
+
+
+def frequencies(omega_bounds: tuple[float, float], sigma_min: float, period: float, cutoff: float = 3.0) -> Tensor:
+    """``[F]`` rad/m, float64: multiples of 2π/period that carry the spectrum of every admissible virtual pulse.
+
+    Args:
+        omega_bounds: smallest and largest Ω_pf, rad/m.
+        sigma_min: smallest σ_pf, m.
+        period: path length after which the sampled pulse repeats, m.
+        cutoff: half-width of the band around Ω_pf in units of 1/σ_pf.
+    """
+    step = 2 * math.pi / period
+    first = max(1, math.floor((omega_bounds[0] - cutoff / sigma_min) / step))
+    last = math.ceil((omega_bounds[1] + cutoff / sigma_min) / step)
+    return step * torch.arange(first, last + 1, dtype=torch.float64)
+
+
+def weight_basis(omega: Tensor, omega_bounds: tuple[float, float], sigma_bounds: tuple[float, float], tolerance: float) -> Tensor:
+    """Orthonormal ``[F, R]`` whose span holds every admissible spectrum within ``tolerance`` (relative, 2-norm).
+
+    The family is sampled densely against its own width (a fifth of 1/σ in Ω), so what lies between the samples is in the span too.
+    """
+    sigmas = torch.exp(torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 12, dtype=torch.float64))
+    family = []
+    for sigma in sigmas:
+        centres = torch.linspace(*omega_bounds, 3 + int((omega_bounds[1] - omega_bounds[0]) * float(sigma) * 5), dtype=torch.float64)
+        weights = virtual_illumination(omega[:, None], centres, sigma)
+        family.append(weights / weights.norm(dim=0))
+    samples = torch.cat(family, dim=1)
+    left, _, _ = torch.linalg.svd(samples, full_matrices=False)
+    for rank in range(1, left.shape[1] + 1):
+        basis = left[:, :rank]
+        if float((samples - basis @ (basis.T @ samples)).norm(dim=0).max()) <= tolerance:
+            return basis
+    return left
+
+
+def lattice_phasors(
+    field: Tensor,
+    omega: Tensor,
+    basis: Tensor,
+    *,
+    pitch: tuple[float, float],
+    offset: tuple[int, int],
+    shape: tuple[int, int],
+    depth: Tensor,
+    fixed: Tensor | None = None,
+    voxel_origin: tuple[float, float] = (0.0, 0.0),
+) -> Iterator[Tensor]:
+    """Propagate a planar aperture to planes parallel to it by linear (zero-padded) convolution, one plane at a time.
+
+    Args:
+        field: ``[L, F, nx, ny]`` complex spectrum on the aperture lattice; L = 1 but for exhaustive scans.
+        omega: ``[F]`` rad/m.
+        basis: ``[F, R]`` as from :func:`weight_basis`.
+        pitch: spacing of the lattice, m; voxels lie on the same lattice.
+        offset: index of the first voxel column and row relative to the aperture's first point.
+        shape: ``(mx, my)`` voxels of a plane.
+        depth: ``[nz]`` distances of the planes from the aperture, m.
+        fixed: ``[L, 3]`` the other wall point of each of the L scans (relative to the aperture's plane), m; None when confocal.
+        voxel_origin: x, y of voxel [0, 0] in the frame of ``fixed``, m.
+
+    Yields:
+        ``[mx·my, 2, R]`` float32, real and imaginary part, plane after plane.
+    """
+    n_scans, n_freq, nx, ny = field.shape
+    mx, my = shape
+    padded = [next_fast_length(nx + mx - 1), next_fast_length(ny + my - 1)]
+    aperture = torch.fft.fft2(field, s=padded)
+    device = field.device
+    confocal = fixed is None
+    # Voxel m lies m - n + offset lattice steps from aperture point n; the kernel is even, so only absolute steps are evaluated.
+    index = []
+    for axis, n, m in ((0, nx, mx), (1, ny, my)):
+        shifts = torch.zeros(padded[axis], dtype=torch.long)
+        for displacement in range(1 - n, m):
+            shifts[displacement % padded[axis]] = abs(displacement + offset[axis])
+        index.append(shifts.to(device))
+    squares = [
+        (pitch[a] * torch.arange(int(index[a].max()) + 1, dtype=torch.float64, device=device)) ** 2 for a in (0, 1)
+    ]
+    lateral = squares[0][:, None] + squares[1][None, :]
+    wave = omega.to(device)[:, None, None] * (2.0 if confocal else 1.0)
+    weights = basis.to(device=device, dtype=torch.float32)
+    rank = weights.shape[1]
+    if not confocal:
+        xs = voxel_origin[0] + pitch[0] * torch.arange(mx, dtype=torch.float64, device=device)
+        ys = voxel_origin[1] + pitch[1] * torch.arange(my, dtype=torch.float64, device=device)
+    for z in depth.tolist():
+        distance = torch.sqrt(lateral + z * z)
+        magnitude = 1 / distance**2 if confocal else 1 / distance
+        kernel = _polar(magnitude, -wave * distance)
+        spread = torch.fft.fft2(kernel[:, index[0]][:, :, index[1]])
+        if confocal:
+            mixed = _mix(weights, aperture[0] * spread)
+            plane = torch.fft.ifft2(mixed)[:, :mx, :my]
+        else:
+            plane = torch.zeros(rank, mx, my, dtype=torch.complex64, device=device)
+            for scan in range(n_scans):
+                arrived = torch.fft.ifft2(aperture[scan] * spread)[:, :mx, :my]
+                leg = torch.sqrt((xs[:, None] - fixed[scan, 0]) ** 2 + (ys - fixed[scan, 1]) ** 2 + (z - fixed[scan, 2]) ** 2)
+                plane += _mix(weights, arrived * _polar(1 / leg, -wave * leg))
+        yield torch.view_as_real(plane).permute(1, 2, 3, 0).reshape(mx * my, 2, rank)
+
+
+def direct_phasors(
+    field: Tensor, omega: Tensor, basis: Tensor, laser: Tensor, sensor: Tensor, voxels: Tensor, block: int = 256
+) -> Iterator[Tensor]:
+    """The same sum for any wall and any spots, voxel block after voxel block.
+
+    Args:
+        field: ``[F, S]`` complex spectrum per spot.
+        omega: ``[F]`` equally spaced, rad/m.
+        basis: ``[F, R]``.
+        laser, sensor: ``[S, 3]`` m.
+        voxels: ``[V, 3]`` m.
+
+    Yields:
+        ``[≤ block, 2, R]`` float32.
+    """
+    device = field.device
+    weights = basis.to(device=device, dtype=torch.float32)
+    omega = omega.to(device)
+    step = omega[1] - omega[0] if len(omega) > 1 else omega[0]
+    same = torch.equal(laser, sensor)
+    for chunk in voxels.to(device).split(block):
+        to_sensor = torch.cdist(chunk.double(), sensor.to(device).double())
+        to_laser = to_sensor if same else torch.cdist(chunk.double(), laser.to(device).double())
+        path = to_sensor + to_laser
+        factor = _polar(1 / (to_sensor * to_laser), -omega[0] * path)
+        advance = _polar(torch.ones_like(path), -step * path)
+        values = torch.empty(len(omega), len(chunk), dtype=torch.complex64, device=device)
+        for f in range(len(omega)):
+            values[f] = factor @ field[f]
+            factor = factor * advance
+        yield torch.view_as_real(_mix(weights, values)).permute(1, 2, 0).contiguous()
+
+
+class PhasorMagnitude(torch.autograd.Function):
+    """``|Σ_r w_r A[v, r]|`` for all voxels; the backward pass touches only the voxels that received a gradient.
+
+    Inputs: basis field ``[V, 2, R]`` (any float type) and weights ``[R]`` float32. Output ``[V]`` float32, m⁻²-weighted counts.
+    """
+
+    @staticmethod
+    def forward(ctx, field: Tensor, weights: Tensor) -> Tensor:
+        voxels = field.shape[0]
+        rows = field.reshape(2 * voxels, -1)
+        if field.dtype == weights.dtype:
+            parts = (rows @ weights).view(voxels, 2)
+        else:
+            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(1 << 19)]).view(voxels, 2)
+        magnitude = torch.linalg.vector_norm(parts, dim=1)
+        ctx.save_for_backward(field, parts, magnitude)
+        return magnitude
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[None, Tensor]:
+        field, parts, magnitude = ctx.saved_tensors
+        touched = torch.nonzero((grad != 0) & (magnitude > 0)).squeeze(1)
+        result = torch.zeros(field.shape[2], dtype=parts.dtype, device=parts.device)
+        for chunk in touched.split(1 << 19):
+            pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
+            result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(2 * len(chunk), -1)
+        return None, result
+
+
+def next_fast_length(n: int) -> int:
+    """Smallest number ≥ n whose only prime factors are 2, 3 and 5."""
+    while True:
+        rest = n
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return n
+        n += 1
+
+
+def _polar(magnitude: Tensor, phase: Tensor) -> Tensor:
+    """Complex64 from float64 magnitude and phase; the phase is reduced before it loses digits."""
+    turn = torch.remainder(phase, 2 * math.pi).to(torch.float32)
+    return torch.polar(magnitude.to(torch.float32).expand_as(turn), turn)
+
+
+def _mix(weights: Tensor, values: Tensor) -> Tensor:
+    """``Σ_f weights[f, r] values[f, …]`` with real weights and complex values."""
+    flat = torch.view_as_real(values.contiguous()).reshape(values.shape[0], -1)
+    return torch.view_as_complex((weights.T @ flat).reshape(-1, *values.shape[1:], 2))

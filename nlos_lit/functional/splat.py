@@ -1,0 +1,48 @@
+"""Adding path contributions to the few time bins around their arrival, without losing or inventing energy."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def gaussian_splat(
+    contribution: Tensor, time: Tensor, spot: Tensor, n_spots: int, n_bins: int, sigma: float, normalise: bool = True
+) -> Tensor:
+    """Scatter paths into ``[n_spots, n_bins]`` transients with the Gaussian of Sec. 4.3.
+
+    The paper's Gaussian has a unit peak, so its sum over bins depends on the sub-bin phase (±0.1 % at σ = 0.62, ±5.7 % at 0.425:
+    a fake detector non-linearity). With ``normalise`` each path's weights are divided by their sum: energy is then conserved exactly.
+
+    Args:
+        contribution: ``[K]`` energy of each path.
+        time: ``[K]`` arrival in bins; bin k is centred on k + ½.
+        spot: ``[K]`` row of each path.
+        sigma: σ_t in bins.
+
+    Paths whose window leaves [0, n_bins) lose what lies outside, as light outside the recorded window is lost.
+    """
+    half = max(3, int(torch.ceil(torch.tensor(4.5 * sigma))))
+    offsets = torch.arange(-half, half + 1, device=time.device)
+    centre = torch.floor(time.detach()).long()
+    bins = centre[:, None] + offsets
+    exponent = -0.5 * ((bins + 0.5 - time[:, None]) / sigma) ** 2
+    weights = torch.exp(exponent)
+    if normalise:
+        weights = weights / weights.sum(1, keepdim=True)
+    values = contribution[:, None] * weights
+    inside = (bins >= 0) & (bins < n_bins)
+    index = (spot[:, None] * n_bins + bins).clamp(0, n_spots * n_bins - 1)
+    flat = torch.zeros(n_spots * n_bins, dtype=values.dtype, device=values.device)
+    flat = flat.index_add(0, index.reshape(-1), torch.where(inside, values, torch.zeros_like(values)).reshape(-1))
+    return flat.view(n_spots, n_bins)
+
+
+def splat_variance(sigma: float) -> float:
+    """Variance in bins² that :func:`gaussian_splat` adds to an arrival time, averaged over sub-bin phases."""
+    phase = torch.linspace(0, 1, 65, dtype=torch.float64)[:-1]
+    half = 12
+    bins = torch.arange(-half, half + 1, dtype=torch.float64) + 0.5
+    weights = torch.exp(-0.5 * ((bins - phase[:, None]) / sigma) ** 2)
+    weights = weights / weights.sum(1, keepdim=True)
+    return float(((weights * (bins - phase[:, None]) ** 2).sum(1)).mean())

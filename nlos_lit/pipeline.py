@@ -1,0 +1,61 @@
+"""The simulated measurement: H → I_pf → G → H_r → H_R, four submodules in a row. Torch alone."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nlos_lit.albedo import FreeAlbedo, ResidualAlbedo
+from nlos_lit.capture import Capture
+from nlos_lit.functional.march import trilinear
+from nlos_lit.geometry import ImplicitGeometry, Surface
+from nlos_lit.laser_sensor import LaserSensor
+from nlos_lit.phasor import PhasorImaging
+from nlos_lit.renderer import TransientRenderer
+
+
+class Rendering(NamedTuple):
+    """Everything one forward pass finds for a batch of S spots."""
+
+    expected: Tensor  # [S, T_gate] H_R, counts
+    intensity: Tensor  # [nz, nx, ny] I_pf
+    albedo: Tensor  # [nz, nx, ny] ρ
+    surface: Surface
+    surface_albedo: Tensor  # [K]
+
+
+class Pipeline(nn.Module):
+    """Phasor imaging, implicit geometry, transient rendering and laser-sensor response over one capture's wall points."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        phasor: PhasorImaging,
+        geometry: ImplicitGeometry,
+        albedo: FreeAlbedo | ResidualAlbedo,
+        renderer: TransientRenderer,
+        laser_sensor: LaserSensor,
+    ) -> None:
+        super().__init__()
+        self.phasor, self.geometry, self.albedo = phasor, geometry, albedo
+        self.renderer, self.laser_sensor = renderer, laser_sensor
+        self.gate = capture.gate
+        for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
+            self.register_buffer(name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False)
+
+    def forward(self, spots: Tensor) -> Rendering:
+        """Args: spots ``[S]`` rows of the capture."""
+        intensity = self.phasor()
+        albedo = self.albedo(intensity)
+        rendered, surface, surface_albedo = self.render(intensity, albedo, spots)
+        return Rendering(self.laser_sensor(rendered)[:, self.gate[0] :], intensity, albedo, surface, surface_albedo)
+
+    def render(self, intensity: Tensor, albedo: Tensor, spots: Tensor) -> tuple[Tensor, Surface, Tensor]:
+        """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given volume."""
+        laser, sensor = self.laser[spots], self.sensor[spots]
+        surface = self.geometry(intensity, sensor, self.sensor_normal[spots])
+        surface_albedo = trilinear(albedo, surface.point, self.geometry.lattice)
+        rendered = self.renderer(surface, surface_albedo, laser, self.laser_normal[spots], sensor, self.sensor_normal[spots])
+        return rendered, surface, surface_albedo
