@@ -1,0 +1,116 @@
+"""Hidden scenes without downloads: plates, spheres, strokes, and the embedded default scene.
+
+Everything faces the wall (normals towards -z) unless turned; x to the right, y up, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from data_modules.simulate.mesh import Mesh, join, load_mesh
+
+
+def plate(
+    centre: tuple[float, float, float], width: float, height: float, *, turn_x: float = 0.0, turn_y: float = 0.0, albedo: float = 1.0
+) -> Mesh:
+    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre by ``turn_x``, then ``turn_y`` radians."""
+    x, y = width / 2, height / 2
+    corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]])
+    cx, sx, cy, sy = np.cos(turn_x), np.sin(turn_x), np.cos(turn_y), np.sin(turn_y)
+    about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    return Mesh(corners @ (about_y @ about_x).T + np.asarray(centre), np.array([[0, 1, 2], [0, 2, 3]]), albedo)
+
+
+def sphere(
+    centre: tuple[float, float, float], radius: float, *, rings: int = 24, opening: float = np.pi, albedo: float = 1.0
+) -> Mesh:
+    """A sphere of latitude rings about the pole nearest the wall, out to the polar angle ``opening`` (π/2: a dome)."""
+    segments = 2 * rings
+    polar = np.linspace(0, opening, rings + 1)[:, None]
+    around = 2 * np.pi * np.arange(segments) / segments
+    unit = np.stack(np.broadcast_arrays(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), -np.cos(polar)), axis=2)
+    i, j = (n.ravel() for n in np.meshgrid(np.arange(rings), np.arange(segments), indexing="ij"))
+    a, b = i * segments + j, i * segments + (j + 1) % segments
+    c, d = b + segments, a + segments
+    faces = np.concatenate([np.stack([a, c, b], axis=1)[i > 0], np.stack([a, d, c], axis=1)])
+    return Mesh(unit.reshape(-1, 3) * radius + np.asarray(centre), faces, albedo)
+
+
+def strokes(
+    lines: list[np.ndarray], *, depth: float, stroke: float, bevel: float = 0.0, cell: float = 0.01, albedo: float = 1.0
+) -> Mesh:
+    """A plate in the shape of drawn lines, its rim bent back from the wall.
+
+    Args:
+        lines: polylines ``[N, 2]`` of (x, y), m, drawn with a square pen.
+        depth: z of the plate, m.
+        stroke: width of the lines, m.
+        bevel: how far the outermost ``cell`` leans back, m.
+        cell: grid of the outline, m.
+        albedo: reflectance.
+    """
+    ends = np.concatenate(lines)
+    low = ends.min(axis=0) - stroke / 2
+    shape = np.ceil((np.ptp(ends, axis=0) + stroke) / cell - 1e-9).astype(int)
+    centres = low + cell * (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=2) + 0.5)
+    inside = np.zeros(shape, dtype=bool)
+    for line in lines:
+        for start, end in zip(line[:-1], line[1:], strict=True):
+            along = (end - start) / np.linalg.norm(end - start)
+            offset = centres - (start + end) / 2
+            reach = np.abs(offset @ along) <= (np.linalg.norm(end - start) + stroke) / 2
+            inside |= reach & (np.abs(offset @ np.array([-along[1], along[0]])) <= stroke / 2)
+    padded = np.pad(inside, 1)
+    rim = ~(padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1])  # grid corners that touch the outside
+    corner = low + cell * np.stack(np.meshgrid(*(np.arange(n + 1) for n in shape), indexing="ij"), axis=2)
+    vertices = np.concatenate([corner, (depth + bevel * rim)[..., None]], axis=2).reshape(-1, 3)
+    i, j = np.nonzero(inside)
+    a = i * (shape[1] + 1) + j
+    b, c, d = a + shape[1] + 1, a + shape[1] + 2, a + 1
+    faces = np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)])
+    used, faces = np.unique(faces, return_inverse=True)
+    return Mesh(vertices[used], faces.reshape(-1, 3), albedo)
+
+
+def default_scene() -> Mesh:
+    """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome (albedo 0.9).
+
+    Nothing about it is symmetric in x or y. The dome's pole is at z = 0.68 m, its base partly hidden behind the F's stem.
+    """
+    f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
+    letter = strokes(f, depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
+    dome = sphere((0.06, -0.20, 0.86), 0.18, rings=16, opening=np.pi / 2, albedo=0.9)
+    return join(letter, dome)
+
+
+def letters() -> Mesh:
+    """An S at z = 0.6 m and, 0.3 m behind it and to its right, a U; the S is the darker one."""
+    angle = np.linspace(0, 1, 25)[:, None]
+    top = np.concatenate([np.cos(np.pi * (0.1 + 1.4 * angle)), np.sin(np.pi * (0.1 + 1.4 * angle))], axis=1) * 0.1 + [-0.18, 0.10]
+    bottom = np.concatenate([np.cos(np.pi * (0.5 - 1.4 * angle)), np.sin(np.pi * (0.5 - 1.4 * angle))], axis=1) * 0.1 + [-0.18, -0.10]
+    bowl = np.concatenate([-np.cos(np.pi * angle), -np.sin(np.pi * angle)], axis=1) * [0.12, 0.10] + [0.18, -0.08]
+    u = np.concatenate([[[0.06, 0.22]], bowl, [[0.30, 0.22]]])
+    return join(
+        strokes([np.concatenate([top, bottom])], depth=0.6, stroke=0.07, albedo=0.5),
+        strokes([u], depth=0.9, stroke=0.08, albedo=1.0),
+    )
+
+
+def sphere_before_plate() -> Mesh:
+    """A sphere of 0.25 m radius partly in front of a plate turned by 20° about y."""
+    return join(sphere((-0.35, 0.2, 0.85), 0.25, rings=48), plate((0.35, -0.2, 1.3), 0.6, 0.6, turn_y=np.deg2rad(20)))
+
+
+def bunny_two_albedo(mesh_path: str | Path) -> Mesh:
+    """Any mesh in two albedos: 1.0 above the middle of its height, 0.3 below, as the paper's Bunny has."""
+    mesh = load_mesh(mesh_path)
+    height = mesh.corners[:, :, 1].mean(axis=1)
+    middle = (mesh.vertices[:, 1].min() + mesh.vertices[:, 1].max()) / 2
+    return Mesh.from_face_albedo(mesh.vertices, mesh.faces, np.where(height > middle, 1.0, 0.3))
+
+
+SCENES: dict[str, Callable[[], Mesh]] = {"default": default_scene, "letters": letters, "sphere_before_plate": sphere_before_plate}

@@ -1,0 +1,103 @@
+"""What is really there: depth, normals and albedo as seen from the wall along z."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from data_modules.simulate.mesh import Mesh
+from data_modules.simulate.visibility import Occluder
+from nlos_lit.errors import UserError
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The hidden surface on a regular lattice of (x, y), NaN where there is nothing.
+
+    Args:
+        x: ``[nx]`` lattice, m.
+        y: ``[ny]`` lattice, m.
+        depth: ``[nx, ny]`` z of the first surface along +z, m.
+        normal: ``[nx, ny, 3]`` its unit normal, on the side seen from the wall.
+        albedo: ``[nx, ny]`` its reflectance; 0 where the black back of a one-sided face is seen.
+        mesh: the surface itself.
+        clean: ``[S, T]`` radiance per bin and laser power before the sensor, where asked for.
+        expected: ``[S, T]`` expected counts (response, exposure and background in), where asked for.
+        gain: counts per unit of ``clean``.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    depth: np.ndarray
+    normal: np.ndarray
+    albedo: np.ndarray
+    mesh: Mesh
+    clean: np.ndarray | None = None
+    expected: np.ndarray | None = None
+    gain: float | None = None
+
+
+def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool = False) -> Truth:
+    """Look at ``mesh`` from the wall along z through a lattice ``x`` × ``y``."""
+    start = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], axis=2).reshape(-1, 3)
+    distance, face, weights = Occluder(mesh).first_hit(start, np.broadcast_to([0.0, 0.0, 1.0], start.shape))
+    hit = np.isfinite(distance)
+    face, weights = face[hit], weights[hit]
+    depth, albedo = np.full(len(start), np.nan), np.full(len(start), np.nan)
+    normal = np.full(start.shape, np.nan)
+    corners = mesh.corners[face]
+    depth[hit] = (weights * corners[:, :, 2]).sum(axis=1)
+    vectors = mesh.face_vectors[face]
+    unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+    behind = unit[:, 2] > 0
+    normal[hit] = np.where(behind[:, None], -unit, unit)
+    albedo[hit] = np.where(behind & (not two_sided), 0.0, (weights * mesh.albedo[mesh.faces[face]]).sum(axis=1))
+    shape = (len(x), len(y))
+    return Truth(np.asarray(x), np.asarray(y), depth.reshape(shape), normal.reshape(*shape, 3), albedo.reshape(shape), mesh)
+
+
+def save_truth(path: str | Path, truth: Truth) -> None:
+    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and, where there, the transients."""
+    with h5py.File(path, "w") as file:
+        for name in ("x", "y", "depth", "normal", "albedo", "clean", "expected"):
+            values = getattr(truth, name)
+            if values is not None:
+                file.create_dataset(name, data=values.astype(np.float32), compression="gzip")
+        for name in ("vertices", "faces", "albedo"):
+            file.create_dataset(f"mesh/{name}", data=getattr(truth.mesh, name), compression="gzip")
+        if truth.gain is not None:
+            file["gain"] = truth.gain
+
+
+def load_truth(path: str | Path, mesh: Mesh | None = None) -> Truth:
+    """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y`` (nothing there: -1 or NaN).
+
+    Args:
+        path: HDF5 file.
+        mesh: the surface, for files that do not hold it.
+
+    Raises:
+        UserError: no such file, not HDF5, or a key is missing.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise UserError(f"there is no ground-truth file {path}")
+    if not h5py.is_hdf5(path):
+        raise UserError(f"{path} is not an HDF5 file; ground truth is HDF5 with depth, normal, x and y")
+    with h5py.File(path, "r") as file:
+        missing = [name for name in ("x", "y", "depth", "normal") if name not in file]
+        if missing or (mesh is None and "mesh" not in file):
+            raise UserError(f"{path} lacks {', '.join(missing) or 'a mesh (give one)'}; ground truth holds depth, normal, x, y and mesh")
+        data = {name: file[name][()].astype(np.float64) for name in ("x", "y", "depth", "normal")}
+        nothing = ~(data["depth"] > 0)
+        data["depth"][nothing] = np.nan
+        data["normal"][nothing] = np.nan
+        albedo = file["albedo"][()].astype(np.float64) if "albedo" in file else np.where(nothing, np.nan, 1.0)
+        if mesh is None:
+            mesh = Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo")))
+        truth = Truth(**data, albedo=albedo, mesh=mesh)
+        extra = {name: file[name][()] for name in ("clean", "expected") if name in file}
+        return replace(truth, **extra, gain=float(file["gain"][()]) if "gain" in file else None)
