@@ -70,7 +70,7 @@ def simulate_capture(
     inside = clean.sum() / fine.sum()
     end = scan.t_start + scan.n_bins * scan.bin_length
     if inside == 0:
-        raise UserError(f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; move or lengthen the time window")
+        raise UserError(f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; change the time window")
     if inside < 0.99:
         log.warning("%.0f %% of the light arrives outside the window of %g … %g m of path", 100 * (1 - inside), scan.t_start, end)
     gain = sensor.mean_counts * len(laser) / clean.sum()
@@ -86,7 +86,7 @@ def simulate_capture(
         "sensor": dataclasses.asdict(sensor) | {"kappa": sensor.kappa if np.isfinite(sensor.kappa) else None},
         "seed": seed,
         "detail": detail,
-        "light_inside_window": float(inside),
+        "light_inside_window": min(float(inside), 1.0),
         "steps": [],
     }
     capture = Capture(

@@ -32,7 +32,7 @@ class Mesh:
     def __post_init__(self) -> None:
         vertices = np.asarray(self.vertices, dtype=np.float64)
         faces = np.asarray(self.faces, dtype=np.int64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or 0 in (len(vertices), len(faces)):
+        if any(a.ndim != 2 or a.shape[1] != 3 or len(a) == 0 for a in (vertices, faces)):
             raise UserError(f"a mesh needs vertices [V, 3] and faces [F, 3]; found {vertices.shape} and {faces.shape}")
         if not np.isfinite(vertices).all():
             raise UserError("the mesh has vertices that are NaN or infinite")

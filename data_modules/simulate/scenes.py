@@ -6,6 +6,7 @@ Everything faces the wall (normals towards -z) unless turned; x to the right, y 
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,9 @@ from data_modules.simulate.mesh import Mesh, join, load_mesh
 
 
 def plate(
-    centre: tuple[float, float, float], width: float, height: float, *, turn_x: float = 0.0, turn_y: float = 0.0, albedo: float = 1.0
+    centre: tuple[float, float, float], width: float, height: float, *, turn_x: float = 0, turn_y: float = 0, albedo: float = 1
 ) -> Mesh:
-    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre by ``turn_x``, then ``turn_y`` radians."""
+    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre: ``turn_x``, then ``turn_y``, rad."""
     x, y = width / 2, height / 2
     corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]])
     cx, sx, cy, sy = np.cos(turn_x), np.sin(turn_x), np.cos(turn_y), np.sin(turn_y)
@@ -36,7 +37,7 @@ def sphere(
     i, j = (n.ravel() for n in np.meshgrid(np.arange(rings), np.arange(segments), indexing="ij"))
     a, b = i * segments + j, i * segments + (j + 1) % segments
     c, d = b + segments, a + segments
-    faces = np.concatenate([np.stack([a, c, b], axis=1)[i > 0], np.stack([a, d, c], axis=1)])
+    faces = np.concatenate([np.stack([a, b, c], axis=1)[i > 0], np.stack([a, c, d], axis=1)])
     return Mesh(unit.reshape(-1, 3) * radius + np.asarray(centre), faces, albedo)
 
 
@@ -46,7 +47,7 @@ def strokes(
     """A plate in the shape of drawn lines, its rim bent back from the wall.
 
     Args:
-        lines: polylines ``[N, 2]`` of (x, y), m, drawn with a square pen.
+        lines: polylines ``[N, 2]`` of (x, y), m, drawn with a round pen.
         depth: z of the plate, m.
         stroke: width of the lines, m.
         bevel: how far the outermost ``cell`` leans back, m.
@@ -59,11 +60,12 @@ def strokes(
     centres = low + cell * (np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), axis=2) + 0.5)
     inside = np.zeros(shape, dtype=bool)
     for line in lines:
-        for start, end in zip(line[:-1], line[1:], strict=True):
+        for start, end in pairwise(line):
             along = (end - start) / np.linalg.norm(end - start)
             offset = centres - (start + end) / 2
-            reach = np.abs(offset @ along) <= (np.linalg.norm(end - start) + stroke) / 2
-            inside |= reach & (np.abs(offset @ np.array([-along[1], along[0]])) <= stroke / 2)
+            across = np.abs(offset @ np.array([-along[1], along[0]])) <= stroke / 2
+            inside |= across & (np.abs(offset @ along) <= np.linalg.norm(end - start) / 2)
+        inside |= (np.linalg.norm(centres[:, :, None] - line, axis=3) <= stroke / 2).any(axis=2)
     padded = np.pad(inside, 1)
     rim = ~(padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1])  # grid corners that touch the outside
     corner = low + cell * np.stack(np.meshgrid(*(np.arange(n + 1) for n in shape), indexing="ij"), axis=2)
@@ -79,7 +81,7 @@ def strokes(
 def default_scene() -> Mesh:
     """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome (albedo 0.9).
 
-    Nothing about it is symmetric in x or y. The dome's pole is at z = 0.68 m, its base partly hidden behind the F's stem.
+    Nothing about it is symmetric in x or y. The dome reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
     letter = strokes(f, depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
@@ -89,13 +91,15 @@ def default_scene() -> Mesh:
 
 def letters() -> Mesh:
     """An S at z = 0.6 m and, 0.3 m behind it and to its right, a U; the S is the darker one."""
-    angle = np.linspace(0, 1, 25)[:, None]
-    top = np.concatenate([np.cos(np.pi * (0.1 + 1.4 * angle)), np.sin(np.pi * (0.1 + 1.4 * angle))], axis=1) * 0.1 + [-0.18, 0.10]
-    bottom = np.concatenate([np.cos(np.pi * (0.5 - 1.4 * angle)), np.sin(np.pi * (0.5 - 1.4 * angle))], axis=1) * 0.1 + [-0.18, -0.10]
-    bowl = np.concatenate([-np.cos(np.pi * angle), -np.sin(np.pi * angle)], axis=1) * [0.12, 0.10] + [0.18, -0.08]
-    u = np.concatenate([[[0.06, 0.22]], bowl, [[0.30, 0.22]]])
+
+    def arc(x: float, y: float, rx: float, ry: float, start: float, turn: float) -> np.ndarray:
+        angle = np.deg2rad(start + turn * np.linspace(0, 1, 25))
+        return np.stack([x + rx * np.cos(angle), y + ry * np.sin(angle)], axis=1)
+
+    s = np.concatenate([arc(-0.18, 0.10, 0.1, 0.1, 18, 252), arc(-0.18, -0.10, 0.1, 0.1, 90, -252)])
+    u = np.concatenate([[[0.06, 0.22]], arc(0.18, -0.08, 0.12, 0.10, 180, 180), [[0.30, 0.22]]])
     return join(
-        strokes([np.concatenate([top, bottom])], depth=0.6, stroke=0.07, albedo=0.5),
+        strokes([s], depth=0.6, stroke=0.07, albedo=0.5),
         strokes([u], depth=0.9, stroke=0.08, albedo=1.0),
     )
 

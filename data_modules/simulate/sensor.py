@@ -12,6 +12,7 @@ from nlos_lit.errors import UserError
 
 GAUSS_REACH = 8.0  # σ on either side, 1e-15 of the energy beyond
 TAIL_REACH = 36.0  # lengths 1/κ of the exponential, 2e-16 beyond
+SPOT_BLOCK = 256  # spots convolved at a time, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class SensorModel:
     direct_counts: float = 0.0
 
     def __post_init__(self) -> None:
-        if not (0 <= self.sigma < np.inf and self.kappa > 0 and min(self.background, self.direct_counts) >= 0 and self.mean_counts > 0):
+        finite = (self.sigma, self.background, self.mean_counts, self.direct_counts)
+        if not (np.isfinite(finite).all() and min(finite) >= 0 and self.mean_counts > 0 and self.kappa > 0):
             raise UserError(f"sigma, background and direct_counts must be >= 0, kappa and mean_counts > 0; found {self}")
 
     @property
@@ -77,8 +79,12 @@ def response_kernel(sigma: float, kappa: float, bin_length: float) -> tuple[np.n
 def respond(transients: np.ndarray, sensor: SensorModel, bin_length: float) -> np.ndarray:
     """Transients ``[S, T]`` as the sensor sees them, same bins; each bin's light is taken to arrive at its centre."""
     kernel, first = response_kernel(sensor.sigma, sensor.kappa, bin_length)
-    full = fftconvolve(transients, kernel[None], axes=1)
-    return np.maximum(full[:, -first : -first + transients.shape[1]], 0)  # the FFT leaves ±1e-17 where there is nothing
+    seen = np.empty_like(transients)
+    for start in range(0, len(transients), SPOT_BLOCK):
+        block = slice(start, start + SPOT_BLOCK)
+        full = fftconvolve(transients[block], kernel[None], axes=1)
+        seen[block] = np.maximum(full[:, -first : -first + transients.shape[1]], 0)  # the FFT leaves ±1e-17 where there is nothing
+    return seen
 
 
 def direct_pulse(sensor: SensorModel, bin_length: float, n_bins: int, t_start: float) -> np.ndarray:

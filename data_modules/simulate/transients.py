@@ -14,6 +14,7 @@ Nothing here is shared with the renderer that is fitted to captures.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,20 +24,26 @@ from data_modules.simulate.mesh import Mesh, subdivide
 from data_modules.simulate.visibility import Occluder
 from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
 
+log = logging.getLogger(__name__)
+
 BLOCK_PAIRS = 1 << 18  # (spot, patch) pairs at a time: a few MB an array, so that they stay in the cache
-TABLE_BYTES = 1 << 30  # legs kept for wall points that several spots share (exhaustive scans)
+TABLE_BYTES = 1 << 28  # legs kept for wall points that several spots share (exhaustive scans)
 PAIRS_PER_SECOND = 4e6  # on one ordinary core; only to say how long a run will take
 LONG_SECONDS = 5.0  # above this a progress bar is shown
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a simulation costs: ``patches`` after splitting, (spot, patch) ``pairs``, rough ``seconds`` and peak ``bytes``."""
+    """What a simulation costs: ``patches`` after splitting, (spot, patch) ``pairs``, rough ``seconds`` and peak ``bytes``.
+
+    ``keep_legs``: the legs of all wall points are computed once, because spots share them (exhaustive scans).
+    """
 
     patches: int
     pairs: int
     seconds: float
     bytes: int
+    keep_legs: bool
 
 
 class Patches:
@@ -54,8 +61,8 @@ class Patches:
 
         def longest_edge(centroids: np.ndarray) -> np.ndarray:
             nearest = np.linalg.norm(centroids - np.clip(centroids, low, high), axis=1)
-            # Path length bends by e²/(4 d) over an edge e: a fortieth of a bin at most.
-            return np.minimum(0.025 * nearest, np.sqrt(0.1 * bin_length * nearest)).clip(1e-4 * self.scale) / detail
+            # Path length bends by e²/(4 d) over an edge e: keep that below a tenth of a bin.
+            return np.minimum(0.025 * nearest, np.sqrt(0.4 * bin_length * nearest)).clip(1e-4 * self.scale) / detail
 
         self.scale = float(np.ptp(mesh.vertices, axis=0).max())
         self.mesh = split = subdivide(mesh, longest_edge)
@@ -66,7 +73,9 @@ class Patches:
         self.centroid = split.corners.mean(axis=1)
         self.albedo = split.albedo[split.faces].mean(axis=1)
         # Rays start off the surface by a little of the patch's own size, but by no less than single precision resolves.
-        self.lift = np.maximum(1e-3 * np.sqrt(self.area), 2e-6 * max(self.scale, float(np.abs(mesh.vertices).max())))
+        lift = np.maximum(1e-3 * np.sqrt(self.area), 2e-6 * max(self.scale, float(np.abs(mesh.vertices).max())))
+        offset = lift[:, None] * self.normal
+        self.front, self.back = ((self.centroid + side * offset).astype(np.float32) for side in (1, -1))
 
     def __len__(self) -> int:
         return len(self.area)
@@ -79,16 +88,16 @@ class Patches:
             patch is reached from behind; distance to every vertex ``[U, V]``, m.
         """
         distance = np.sqrt(_squared_distance(points, self.mesh.vertices))
-        squared = _squared_distance(points, self.centroid)
-        at_wall = normals @ self.centroid.T - (normals * points).sum(axis=1)[:, None]
-        at_patch = points @ self.normal.T - (self.normal * self.centroid).sum(axis=1)
-        lit = (at_wall > 0) & (at_patch != 0) if two_sided else (at_wall > 0) & (at_patch > 0)
+        at_wall = _dots(normals, self.centroid) - (normals * points).sum(axis=1)[:, None]
+        at_patch = _dots(points, self.normal) - (self.normal * self.centroid).sum(axis=1)
+        row, patch = np.nonzero((at_wall > 0) & ((at_patch != 0) if two_sided else (at_patch > 0)))
+        product = at_wall[row, patch] * at_patch[row, patch]
         if occlusion:
-            row, patch = np.nonzero(lit)
-            side = self.lift[patch] * np.sign(at_patch[row, patch])
-            start = self.centroid[patch] + side[:, None] * self.normal[patch]
-            lit[row, patch] = ~self.occluder.blocked(start, points[row])
-        return np.where(lit, at_wall * at_patch / squared**2, 0.0), distance
+            clear = ~self.occluder.blocked(np.where((product > 0)[:, None], self.front[patch], self.back[patch]), points[row])
+            row, patch, product = row[clear], patch[clear], product[clear]
+        factor = np.zeros(at_wall.shape)
+        factor[row, patch] = product / _squared_distance(points, self.centroid)[row, patch] ** 2
+        return factor, distance
 
 
 def simulate_transients(
@@ -163,18 +172,18 @@ def simulate_with_rest(
             raise CaptureError(f"laser and {name} must both be [S, 3]; found {laser.shape} and {value.shape}")
     if not (bin_length > 0 and n_bins > 0 and detail > 0):
         raise UserError(f"bin_length, n_bins and detail must be positive; found {bin_length}, {n_bins} and {detail}")
-    points, rows = np.unique(np.concatenate([np.c_[laser, laser_normal], np.c_[sensor, sensor_normal]]), axis=0, return_inverse=True)
+    ends = np.concatenate([np.c_[laser, laser_normal], np.c_[sensor, sensor_normal]])
+    points, rows = np.unique(ends, axis=0, return_inverse=True)
     laser_row, sensor_row = rows.reshape(2, -1)
     patches = Patches(mesh, points[:, :3], bin_length, detail)
-    cost = _work(patches, len(laser), n_bins)
+    cost = _work(patches, len(laser), len(points), n_bins)
     _check_memory(cost)
+    log.info("simulating %d spots × %d patches, about %.0f s, %.1f GiB", len(laser), cost.patches, cost.seconds, cost.bytes / 2**30)
 
     def legs(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return patches.legs(points[index, :3], points[index, 3:], two_sided, occlusion)
 
-    # Keep the legs of all wall points where spots share them (exhaustive scans), otherwise make them block by block.
-    leg_bytes = 8 * len(points) * (len(patches) + len(patches.mesh.vertices))
-    table = legs(np.arange(len(points))) if 2 * len(points) <= len(laser) and leg_bytes <= TABLE_BYTES else None
+    table = legs(np.arange(len(points))) if cost.keep_legs else None
     weight = patches.area * patches.albedo * (wall_albedo**2 / np.pi**3)
     size = max(1, BLOCK_PAIRS // len(patches))
     starts = range(0, len(laser), size)
@@ -193,7 +202,7 @@ def simulate_with_rest(
         bins = (distance[l] + distance[s] - t_start) / bin_length
         histogram[block] = spread_triangles(energy, bins, patches.mesh.faces, n_bins)
     if not histogram.any():
-        raise UserError("no face of the mesh is turned towards the wall points and visible from them; flip its faces or use two_sided")
+        raise UserError("no face of the mesh is turned towards the wall and visible from it; flip its faces or use two_sided")
     return histogram
 
 
@@ -212,6 +221,8 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
     n_rows, n_vertices = bins.shape
     row, patch = np.nonzero(energy > 0)
     energy = energy[row, patch]
+    if len(energy) == 0:
+        return np.zeros((n_rows, n_bins + 2))
     base = row * n_vertices
     flat = bins.ravel()
     a, b, c = (flat[base + faces[patch, i]] for i in range(3))
@@ -240,13 +251,17 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
 
 def work(mesh: Mesh, laser: np.ndarray, sensor: np.ndarray, *, bin_length: float, n_bins: int, detail: float = 1.0) -> Work:
     """What `simulate_transients` of these arguments would cost."""
-    return _work(Patches(mesh, np.concatenate([laser, sensor]), bin_length, detail), len(laser), n_bins)
+    points = np.concatenate([laser, sensor])
+    return _work(Patches(mesh, points, bin_length, detail), len(laser), len(np.unique(points, axis=0)), n_bins)
 
 
-def _work(patches: Patches, n_spots: int, n_bins: int) -> Work:
+def _work(patches: Patches, n_spots: int, n_points: int, n_bins: int) -> Work:
     pairs = n_spots * len(patches)
-    block = max(BLOCK_PAIRS, len(patches))
-    return Work(len(patches), pairs, pairs / PAIRS_PER_SECOND, 8 * (n_spots * (n_bins + 2) + 40 * block) + TABLE_BYTES)
+    legs = n_points * (len(patches) + len(patches.mesh.vertices))
+    keep_legs = 2 * n_points <= n_spots and 8 * legs <= TABLE_BYTES
+    # The legs are worked out with a few arrays of their size, a block with a few dozen.
+    numbers = n_spots * (n_bins + 2) + 40 * max(BLOCK_PAIRS, len(patches)) + (6 * legs if keep_legs else 0)
+    return Work(len(patches), pairs, pairs / PAIRS_PER_SECOND, 8 * numbers, keep_legs)
 
 
 def _check_memory(cost: Work) -> None:
@@ -255,12 +270,18 @@ def _check_memory(cost: Work) -> None:
     free = psutil.virtual_memory().available
     if cost.bytes > free:
         raise MemoryBudgetError(
-            f"simulating {cost.pairs:.2g} pairs of spot and patch needs {cost.bytes / 2**30:.1f} GiB but {free / 2**30:.1f} GiB are free;"
-            " use fewer spots, fewer bins or less detail"
+            f"simulating {cost.pairs:.2g} pairs of spot and patch needs {cost.bytes / 2**30:.1f} GiB"
+            f" but {free / 2**30:.1f} GiB are free; use fewer spots, fewer bins or less detail"
         )
 
 
 def _squared_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """``[A, B]`` squared distances of points ``[A, 3]`` and ``[B, 3]``."""
-    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * a @ b.T
+    squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2 * _dots(a, b)
     return np.maximum(squared, 1e-12)
+
+
+def _dots(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """``[A, B]`` dot products of vectors ``[A, 3]`` and ``[B, 3]``."""
+    # Three terms are too few for BLAS: its threads cost more than they bring, most of all on a busy machine.
+    return np.einsum("ik,kj->ij", a, np.ascontiguousarray(b.T))

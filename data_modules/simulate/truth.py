@@ -60,7 +60,7 @@ def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool 
 
 
 def save_truth(path: str | Path, truth: Truth) -> None:
-    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and, where there, the transients."""
+    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and the transients, if any."""
     with h5py.File(path, "w") as file:
         for name in ("x", "y", "depth", "normal", "albedo", "clean", "expected"):
             values = getattr(truth, name)
@@ -90,7 +90,8 @@ def load_truth(path: str | Path, mesh: Mesh | None = None) -> Truth:
     with h5py.File(path, "r") as file:
         missing = [name for name in ("x", "y", "depth", "normal") if name not in file]
         if missing or (mesh is None and "mesh" not in file):
-            raise UserError(f"{path} lacks {', '.join(missing) or 'a mesh (give one)'}; ground truth holds depth, normal, x, y and mesh")
+            lacks = ", ".join(missing) or "a mesh (give one)"
+            raise UserError(f"{path} lacks {lacks}; ground truth holds depth, normal, x, y and mesh")
         data = {name: file[name][()].astype(np.float64) for name in ("x", "y", "depth", "normal")}
         nothing = ~(data["depth"] > 0)
         data["depth"][nothing] = np.nan
