@@ -140,9 +140,7 @@ def depth_at(truth: SurfaceTruth, xy: np.ndarray) -> tuple[np.ndarray, np.ndarra
     low = np.clip(np.floor(place).astype(np.int64), 0, shape - 2)
     u, v = np.clip(place - low, 0, 1).T
     i, j = low.T
-    corners = np.stack([truth.depth[i, j], truth.depth[i + 1, j], truth.depth[i, j + 1], truth.depth[i + 1, j + 1]]).astype(
-        np.float64
-    )
+    corners = np.stack([truth.depth[i + di, j + dj] for di, dj in ((0, 0), (1, 0), (0, 1), (1, 1))]).astype(np.float64)
     smooth = np.isfinite(corners).all(axis=0)
     smooth[smooth] = np.ptp(corners[:, smooth], axis=0) < STEEPEST * sum(truth.cell)
     weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])

@@ -26,7 +26,7 @@ class MeshReport:
     reason: str | None = None
 
 
-def poisson_mesh(points: Points, depth: int = 8, trim: float = 2.0) -> tuple[open3d.geometry.TriangleMesh | None, MeshReport]:
+def poisson_mesh(points: Points, depth: int = 8, trim: float = 1.5) -> tuple[open3d.geometry.TriangleMesh | None, MeshReport]:
     """Poisson surface through oriented points, grey by albedo, without what the method invents where there are no points.
 
     Poisson surfaces are closed: behind an open surface they bulge away from the data. The lowest so many per cent of the sampling
@@ -64,7 +64,7 @@ def poisson_mesh(points: Points, depth: int = 8, trim: float = 2.0) -> tuple[ope
     return mesh, MeshReport(len(mesh.vertices), len(mesh.triangles))
 
 
-def write_mesh(path: Path | str, points: Points, depth: int = 8, trim: float = 2.0) -> MeshReport:
+def write_mesh(path: Path | str, points: Points, depth: int = 8, trim: float = 1.5) -> MeshReport:
     """Binary PLY of ``poisson_mesh``; where there is none nothing is written and the report says why."""
     mesh, report = poisson_mesh(points, depth, trim)
     if mesh is not None:

@@ -1,0 +1,187 @@
+"""The repository's own rules, over every tracked file."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+LONGEST = 300
+LONG_MODULES: dict[str, str] = {}  # path → why it is better in one piece
+HEAVY = {"hydra", "lightning", "pytorch_lightning", "omegaconf", "open3d"}
+SUBMODULES = {f"nlos_lit/{name}.py" for name in ("phasor", "geometry", "renderer", "laser_sensor")}
+
+
+def _tracked() -> list[str]:
+    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout: these rules are about tracked files", allow_module_level=True)
+    return [name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()]
+
+
+TRACKED = _tracked()
+MODULES = [name for name in TRACKED if name.endswith(".py")]
+PRODUCT = [name for name in MODULES if not name.startswith("tests/")]
+CORE = [name for name in MODULES if name in SUBMODULES or {"functional", "baselines"} & set(Path(name).parts[:-1])]
+
+
+def syntax(name: str) -> ast.Module:
+    return ast.parse((ROOT / name).read_text(encoding="utf-8"), name)
+
+
+def imported(tree: ast.AST) -> set[str]:
+    """Top-level names of all packages imported anywhere in a module."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+@pytest.mark.parametrize("name", PRODUCT)
+def test_modules_are_short(name):
+    lines = len((ROOT / name).read_text(encoding="utf-8").splitlines())
+    if name in LONG_MODULES:
+        assert lines > LONGEST, f"{name} has become short: take it off the list"
+    else:
+        assert lines <= LONGEST
+
+
+@pytest.mark.parametrize("name", CORE)
+def test_the_core_names_no_framework(name):
+    assert not imported(syntax(name)) & HEAVY
+
+
+def loaded_by(modules: list[str]) -> set[str]:
+    code = f"""import importlib, sys
+for name in {modules!r}:
+    importlib.import_module(name)
+print(*{{name.split(".")[0] for name in sys.modules}})"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def dotted(name: str) -> str:
+    return name.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+
+
+def test_a_machine_with_only_torch_can_import_the_core():
+    assert not loaded_by([dotted(name) for name in CORE]) & HEAVY
+
+
+def test_importing_the_package_loads_no_framework():
+    assert not loaded_by(["nlos_lit", "data_modules"]) & HEAVY
+
+
+def test_no_module_imports_open3d_when_it_is_imported():
+    """Inside functions only, so that everything but meshes and ray casting works without its system libraries."""
+    offenders = []
+    for name in MODULES:
+        body = [node for node in syntax(name).body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))]
+        top = [node for node in body if not isinstance(node, (ast.FunctionDef, ast.ClassDef))]
+        if "open3d" in set().union(*map(imported, top), set()):
+            offenders.append(name)
+    assert offenders == []
+
+
+PLACES = re.compile(r"(?<![\w./~$}-])/(?:work|root|home)(?:/|\b)")
+HOSTS = re.compile(
+    "|".join(name.replace("_", r"\.") for name in ("pypi_org", "pythonhosted_org", "download_pytorch_org", "anaconda_org"))
+)
+
+
+def test_no_file_names_this_machine_or_a_package_host():
+    offenders = []
+    for name in TRACKED:
+        content = (ROOT / name).read_bytes()
+        if b"\0" in content:
+            continue
+        for number, line in enumerate(content.decode("utf-8").splitlines(), 1):
+            if PLACES.search(line) or HOSTS.search(line):
+                offenders.append(f"{name}:{number}: {line.strip()[:100]}")
+    assert offenders == []
+
+
+def test_the_patterns_find_what_they_are_for():
+    assert PLACES.search('open("/ro' + 'ot/x")')
+    assert PLACES.search("path: /wo" + "rk")
+    assert not PLACES.search("tests/work and nlos/home/x and https://example.com/home")
+    assert HOSTS.search("https://py" + "pi.org/simple")
+
+
+def unsafe_calls(tree: ast.AST) -> list[str]:
+    """Calls through which a file could run code."""
+    found = []
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+        loader = arguments.get("Loader", ast.unparse(node.args[1]) if len(node.args) > 1 else "")
+        if (
+            (called == "torch.load" and arguments.get("weights_only") != "True")
+            or (called == "yaml.load" and "Safe" not in loader)
+            or called in ("yaml.unsafe_load", "yaml.full_load", "pickle.load", "pickle.loads", "eval", "exec")
+            or arguments.get("allow_pickle") == "True"
+        ):
+            found.append(f"line {node.lineno}: {ast.unparse(node)}")
+    return found
+
+
+@pytest.mark.parametrize("name", PRODUCT)
+def test_no_file_that_is_read_can_run_code(name):
+    assert unsafe_calls(syntax(name)) == []
+
+
+@pytest.mark.parametrize(
+    ("code", "safe"),
+    [
+        ("torch.load(f)", False),
+        ("torch.load(f, weights_only=True)", True),
+        ("yaml.load(f)", False),
+        ("yaml.load(f, yaml.Loader)", False),
+        ("yaml.load(f, Loader=yaml.CSafeLoader)", True),
+        ("yaml.safe_load(f)", True),
+        ("np.load(f, allow_pickle=True)", False),
+        ("model.eval()", True),
+    ],
+)
+def test_unsafe_calls_are_recognised(code, safe):
+    assert (unsafe_calls(ast.parse(code)) == []) == safe
+
+
+def test_every_declared_dependency_is_pinned():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]
+    pins = [Requirement(line) for line in lines]
+    assert all(re.fullmatch(r"==[^*]+", str(pin.specifier)) for pin in pins)
+    versions = {canonicalize_name(pin.name): str(pin.specifier)[2:] for pin in pins}
+    assert len(versions) == len(pins)
+    for text in project["dependencies"] + project["optional-dependencies"]["dev"]:
+        wanted = Requirement(text)
+        assert versions[canonicalize_name(wanted.name)] in wanted.specifier, text
+
+
+@pytest.mark.parametrize("name", [".ci/run", "scripts/setup.sh"])
+def test_scripts_run(name):
+    assert os.access(ROOT / name, os.X_OK)
+    assert subprocess.run(["bash", "-n", str(ROOT / name)], check=False).returncode == 0
+
+
+def test_ci_runs_the_tests_the_readme_names():
+    assert "make test" in (ROOT / ".ci/run").read_text()
+    dry = subprocess.run(["make", "-n", "-C", str(ROOT), "test", "VENV=nowhere"], capture_output=True, text=True, check=True).stdout
+    assert "scripts/setup.sh" in dry
+    assert dry.index("scripts/setup.sh") < dry.index("nowhere/bin/python -m pytest")
