@@ -86,6 +86,20 @@ def test_plane_agrees_with_direct_quadrature_bin_by_bin():
     assert np.linalg.norm(h - reference) < 0.004 * np.linalg.norm(reference)
 
 
+def test_sphere_agrees_with_its_one_dimensional_integral():
+    """Confocal, the sphere straight ahead: rings of polar angle θ up to the horizon; also shows that no patch shades itself."""
+    distance, radius = 0.6, 0.25
+    theta = np.arccos(radius / distance) * (np.arange(20_000) + 0.5) / 20_000
+    rho = np.sqrt(distance**2 + radius**2 - 2 * distance * radius * np.cos(theta))
+    at_patch, at_wall = (distance * np.cos(theta) - radius) / rho, (distance - radius * np.cos(theta)) / rho
+    ring = 2 * np.pi * radius**2 * np.sin(theta) * np.arccos(radius / distance) / 20_000
+    value = ring * (at_patch * at_wall) ** 2 / rho**4 / np.pi**3
+    reference = np.histogram(2 * rho, bins=0.01 * np.arange(401), weights=value)[0]
+    h = transients(sphere((0, 0, distance), radius, rings=80), (0, 0, 0), (0, 0, 0))[0]
+    assert h.sum() == pytest.approx(value.sum(), rel=2e-3)
+    assert np.linalg.norm(h - reference) < 0.01 * np.linalg.norm(reference)
+
+
 def test_finer_patches_change_little():
     spots = np.array([[0.3, 0.1, 0], [-0.2, -0.4, 0]])
     mesh = join(plate((0.2, 0.1, 0.7), 0.4, 0.3, turn_x=0.5, albedo=0.4), sphere((-0.1, 0, 0.5), 0.15, rings=12))
