@@ -1,0 +1,228 @@
+"""What lies in a file, seen without reading its arrays: the one place where file libraries are touched.
+
+Nothing here can run code from a file: MATLAB objects and function handles, HDF5 references and Python objects are never
+resolved, only plain numbers and text are read. Every failure of a library on a damaged file becomes one `CaptureError`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+import psutil
+import scipy.io
+
+from nlos_lit.errors import CaptureError
+
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
+_MATLAB_NUMBERS = {"double", "single", "logical"} | {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One array: its shape (MATLAB's axis order where MATLAB wrote it), whether it holds real numbers, its full size in bytes."""
+
+    shape: tuple[int, ...]
+    numeric: bool
+    size: int
+
+
+@dataclass(frozen=True)
+class Contents:
+    """The arrays of a file (or of the ``.mat`` files of a folder) by name; fields of a MATLAB struct as ``struct.field``.
+
+    Args:
+        path: the file or folder.
+        container: ``hdf5``, ``mat5`` (MATLAB up to v7.2), ``radiance`` (HDR picture), ``mp4`` or ``folder``.
+        entries: what each array is, by name.
+        matlab: an HDF5 file written by MATLAB (v7.3), whose axes HDF5 shows in reverse.
+        parts: for a folder, the contents of the file that each entry lies in.
+    """
+
+    path: Path
+    container: str
+    entries: dict[str, Entry]
+    matlab: bool = False
+    parts: dict[str, Contents] = field(default_factory=dict)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.entries
+
+    def has(self, *names: str) -> bool:
+        return all(name in self.entries for name in names)
+
+    def ndim(self, name: str) -> int:
+        """Number of axes of a numeric array; -1 where it is absent or not numeric."""
+        entry = self.entries.get(name)
+        return len(entry.shape) if entry is not None and entry.numeric else -1
+
+    def require(self, *names: str) -> None:
+        missing = [name for name in names if name not in self.entries]
+        if missing:
+            raise CaptureError(f"{self.path.name} has no {', '.join(missing)}; it holds {self.summary()}")
+
+    def summary(self) -> str:
+        """The names and shapes, for messages."""
+        if not self.entries:
+            return f"no named arrays ({self.container} file)"
+        shown = [f"{name} {'×'.join(map(str, entry.shape)) or 'scalar'}" for name, entry in list(self.entries.items())[:12]]
+        rest = len(self.entries) - len(shown)
+        return ", ".join(shown) + (f" and {rest} more" if rest > 0 else "")
+
+    def read(self, name: str) -> np.ndarray:
+        """One numeric array, as stored.
+
+        Raises:
+            CaptureError: absent, not real numbers, claiming more data than the file can hold, or damaged.
+        """
+        self.require(name)
+        if name in self.parts:
+            return self.parts[name].read(name)
+        entry = self.entries[name]
+        if not entry.numeric:
+            raise CaptureError(f"{name} in {self.path.name} does not hold real numbers")
+        self._check_size(name, entry)
+        with _damage(self.path):
+            values = self._read_hdf5(name) if self.container == "hdf5" else self._read_mat5(name)
+        values = np.asarray(values)
+        if values.dtype.kind not in "uifb":
+            raise CaptureError(f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})")
+        return values.astype(np.uint8) if values.dtype.kind == "b" else values
+
+    def scalar(self, name: str) -> float:
+        """A finite number stored as an array of one element."""
+        values = self.read(name)
+        if values.size != 1 or not np.isfinite(values).all():
+            raise CaptureError(f"{name} in {self.path.name} must be one finite number; found {values.size} values")
+        return float(values.reshape(()))
+
+    def text(self, name: str) -> str:
+        """A string of an HDF5 file; empty where it is absent or not text."""
+        if self.container != "hdf5" or name not in self.entries:
+            return ""
+        with _damage(self.path), h5py.File(self.path, "r") as file:
+            dataset = file[name]
+            if dataset.shape != () or h5py.check_string_dtype(dataset.dtype) is None:
+                return ""
+            return dataset[()].decode("utf-8", errors="replace")
+
+    def _check_size(self, name: str, entry: Entry) -> None:
+        on_disk = self.path.stat().st_size
+        if entry.size > _DEFLATE_LIMIT * on_disk:
+            raise CaptureError(
+                f"{name} in {self.path.name} claims {entry.size / 1e6:.0f} MB in a file of {on_disk / 1e6:.3g} MB; "
+                "the file is damaged or truncated"
+            )
+        free = psutil.virtual_memory().available
+        if entry.size > free:
+            raise CaptureError(
+                f"{name} in {self.path.name} needs {entry.size / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; use a smaller file"
+            )
+
+    def _read_hdf5(self, name: str) -> np.ndarray:
+        with h5py.File(self.path, "r") as file:
+            values = file[name.replace(".", "/")][()]
+        return values.T if self.matlab and isinstance(values, np.ndarray) else values
+
+    def _read_mat5(self, name: str) -> np.ndarray:
+        variable, _, member = name.partition(".")
+        values = scipy.io.loadmat(self.path, variable_names=[variable])[variable]
+        return values[member].reshape(-1)[0] if member else values
+
+
+def open_contents(path: str | Path) -> Contents:
+    """List a file or folder without reading its arrays (for structs of old MATLAB files: without reading other variables).
+
+    Raises:
+        CaptureError: nothing there, not readable, damaged, or of no known container.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return open_folder(path)
+    if not path.exists():
+        raise CaptureError(f"there is no file {path}")
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(4096)
+    except OSError as error:
+        raise CaptureError(f"{path} cannot be read: {error.strerror or error}") from error
+    if not head:
+        raise CaptureError(f"{path.name} is empty")
+    if any(head[offset : offset + 8] == _HDF5_SIGNATURE for offset in (0, 512, 1024, 2048)):
+        return _list_hdf5(path, head)
+    if head[126:128] in (b"IM", b"MI") and 1 in head[124:126]:
+        return _list_mat5(path)
+    if head.startswith((b"#?RADIANCE", b"#?RGBE")):
+        return Contents(path, "radiance", {})
+    if head[4:8] == b"ftyp":
+        return Contents(path, "mp4", {})
+    if head.startswith(b"MATLAB 7.3"):
+        raise CaptureError(f"{path.name} begins like a MATLAB v7.3 file but holds no HDF5 data; it is damaged or truncated")
+    raise CaptureError(f"{path.name} is neither HDF5, MATLAB nor Radiance HDR; found a file that begins with {head[:8]!r}")
+
+
+def open_folder(path: Path) -> Contents:
+    """The arrays of all ``.mat`` files of a folder together; unreadable files are passed over."""
+    parts: dict[str, Contents] = {}
+    entries: dict[str, Entry] = {}
+    for file in sorted(path.glob("*.mat"))[:64]:
+        try:
+            part = open_contents(file)
+        except CaptureError:
+            continue
+        parts |= dict.fromkeys(part.entries, part)
+        entries |= part.entries
+    if not entries:
+        raise CaptureError(f"{path} is a folder without readable .mat files; name the capture file itself")
+    return Contents(path, "folder", entries, parts=parts)
+
+
+def _list_hdf5(path: Path, head: bytes) -> Contents:
+    entries: dict[str, Entry] = {}
+    matlab = head.startswith(b"MATLAB 7.3")
+    with _damage(path), h5py.File(path, "r") as file:
+        for name, item in file.items():
+            members = {name: item}
+            if isinstance(item, h5py.Group):
+                members = {f"{name}.{member}": value for member, value in item.items()}
+            for label, dataset in members.items():
+                if isinstance(dataset, h5py.Dataset):
+                    matlab = matlab or "MATLAB_class" in dataset.attrs
+                    shape = dataset.shape or ()
+                    numeric = dataset.shape is not None and dataset.dtype.kind in "uifb"
+                    entries[label] = Entry(shape, numeric, math.prod(shape) * dataset.dtype.itemsize)
+    if matlab:
+        entries = {name: Entry(entry.shape[::-1], entry.numeric, entry.size) for name, entry in entries.items()}
+    return Contents(path, "hdf5", entries, matlab)
+
+
+def _list_mat5(path: Path) -> Contents:
+    entries: dict[str, Entry] = {}
+    with _damage(path):
+        for name, shape, kind in scipy.io.whosmat(path):
+            # MATLAB stores doubles that are small integers in fewer bytes, so the stored size may be an eighth
+            entries[name] = Entry(tuple(shape), kind in _MATLAB_NUMBERS, math.prod(shape))
+            if kind == "struct" and math.prod(shape) == 1 and path.stat().st_size < psutil.virtual_memory().available:
+                record = scipy.io.loadmat(path, variable_names=[name])[name]
+                for member in record.dtype.names or ():
+                    value = np.asarray(record[member].reshape(-1)[0])
+                    entries[f"{name}.{member}"] = Entry(value.shape, value.dtype.kind in "uifb", value.nbytes)
+    return Contents(path, "mat5", entries)
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """Whatever a file library raises on a damaged file, as one sentence."""
+    try:
+        yield
+    except CaptureError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise CaptureError(f"{path.name} is damaged or truncated ({reason})") from error

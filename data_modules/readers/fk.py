@@ -1,0 +1,85 @@
+"""Confocal captures of f-k migration (Lindell, Wetzstein, O'Toole, SIGGRAPH 2019): ``meas``, with ``tofgrid`` beside it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from data_modules.readers.assemble import (
+    COMMON_OPTIONS,
+    assemble,
+    bin_length_of,
+    cell_centres,
+    gate_after_direct_pulse,
+    remove_delays,
+    wall_points,
+)
+from data_modules.readers.contents import Contents, open_contents
+from data_modules.readers.options import ReaderOptions
+from nlos_lit.capture import Capture
+from nlos_lit.errors import CaptureError
+
+NAME = "fk"
+DESCRIPTION = "f-k migration .mat v7.3, confocal: bins of 32 ps, wall 2 m × 2 m, counts; rows from the top (-y), columns along -x"
+EXPECTS = "meas [rows, columns, T] in a MATLAB v7.3 file, with tofgrid [rows, columns] in it or in tof.mat beside it"
+OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
+BIN_WIDTH_PS = 32.0
+WALL_SIZE = 2.0
+
+
+def matches(contents: Contents) -> bool:
+    return contents.container == "hdf5" and contents.ndim("meas") == 3
+
+
+def read(path: Path, options: ReaderOptions) -> Capture:
+    """``tofgrid`` (ps) is each spot's time from laser to wall to detector; it is taken off by whole bins."""
+    contents = open_contents(path)
+    contents.require("meas")
+    if contents.ndim("meas") != 3:
+        raise CaptureError(f"meas in {path.name} must be [rows, columns, bins]; found {contents.entries['meas'].shape}")
+    width = options.bin_width_ps or BIN_WIDTH_PS
+    sides = options.wall_sides or (WALL_SIZE, WALL_SIZE)
+    data = contents.read("meas")
+    rows, columns, bins = data.shape
+    counts = data.reshape(rows * columns, bins)
+    steps = [f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m"]
+    t_start = 0.0
+    delays = _delays(contents, (rows, columns))
+    if delays is None:
+        steps.append("no tofgrid: times taken as counted from the wall")
+    else:
+        counts, offset, told = remove_delays(counts, delays / width)
+        t_start = offset * bin_length_of(width)
+        steps.append(f"tofgrid: {told}")
+    points = wall_points(-cell_centres(rows, sides[1]), -cell_centres(columns, sides[0]), "yx")
+    gate, told = gate_after_direct_pulse(counts, bin_length_of(width), t_start) if counts.size else (None, "")
+    return assemble(
+        path,
+        NAME,
+        options,
+        counts=counts,
+        laser=points,
+        sensor=points,
+        bin_length=bin_length_of(width),
+        t_start=t_start,
+        shape=(rows, columns),
+        gate=gate,
+        steps=[*steps, told],
+    )
+
+
+def _delays(contents: Contents, shape: tuple[int, int]) -> np.ndarray | None:
+    """``[S]`` ps from the file itself, or from the ``tof.mat`` that the public data keep in the same folder."""
+    source = contents
+    if "tofgrid" not in contents:
+        beside = contents.path.with_name("tof.mat")
+        if not beside.is_file():
+            return None
+        source = open_contents(beside)
+    delays = source.read("tofgrid")
+    if delays.size == 0:
+        return None
+    if delays.shape != shape:
+        raise CaptureError(f"tofgrid in {source.path.name} is {delays.shape} where meas scans {shape}; use the one of this scene")
+    return delays.ravel().astype(np.float64)

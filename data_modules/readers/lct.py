@@ -1,0 +1,60 @@
+"""Confocal captures of the light-cone transform (O'Toole, Lindell, Wetzstein, Nature 2018): ``rect_data``, ``width``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from data_modules.readers.assemble import (
+    COMMON_OPTIONS,
+    assemble,
+    bin_length_of,
+    cell_centres,
+    gate_after_direct_pulse,
+    wall_points,
+)
+from data_modules.readers.contents import Contents, open_contents
+from data_modules.readers.options import ReaderOptions
+from nlos_lit.capture import Capture
+from nlos_lit.errors import CaptureError
+
+NAME = "lct"
+DESCRIPTION = "LCT .mat, confocal: bins of 4 ps, wall side 2·width, counts; first axis along +x, second along -y"
+EXPECTS = "rect_data [nx, ny, T] and width"
+OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
+BIN_WIDTH_PS = 4.0
+
+
+def matches(contents: Contents) -> bool:
+    return contents.ndim("rect_data") == 3 and "width" in contents and "ts" not in contents
+
+
+def read(path: Path, options: ReaderOptions) -> Capture:
+    """Bin 0 holds the direct pulse's peak, so path zero is its start; spots are the centres of equal cells of the square."""
+    contents = open_contents(path)
+    contents.require("rect_data")
+    if contents.ndim("rect_data") != 3:
+        raise CaptureError(f"rect_data in {path.name} must be [nx, ny, bins]; found {contents.entries['rect_data'].shape}")
+    sides = options.wall_sides
+    if sides is None:
+        half = contents.scalar("width")
+        if half <= 0:
+            raise CaptureError(f"width in {path.name} must be half the wall's side in metres; found {half}")
+        sides = (2 * half, 2 * half)
+    data = contents.read("rect_data")
+    nx, ny, bins = data.shape
+    counts = data.reshape(nx * ny, bins)
+    width = options.bin_width_ps or BIN_WIDTH_PS
+    points = wall_points(cell_centres(nx, sides[0]), -cell_centres(ny, sides[1]), "xy")
+    gate, told = gate_after_direct_pulse(counts, bin_length_of(width), options.t_start or 0.0) if counts.size else (None, "")
+    return assemble(
+        path,
+        NAME,
+        options,
+        counts=counts,
+        laser=points,
+        sensor=points,
+        bin_length=bin_length_of(width),
+        shape=(nx, ny),
+        gate=gate,
+        steps=[f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m", told],
+    )

@@ -1,0 +1,74 @@
+"""What a user may say about a file that the file does not say itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlos_lit.errors import CaptureError
+
+
+@dataclass(frozen=True)
+class ReaderOptions:
+    """Facts that override a format's own; None means "as the format says".
+
+    Args:
+        bin_width_ps: width of one time bin, ps.
+        wall_size: side of the scanned rectangle, m; one number, or ``(x, y)``.
+        t_start: optical path length at the start of bin 0, m.
+        gate: ``(first, last)`` half-open range of bins to fit.
+        flip_x, flip_y: mirror the wall coordinate, for a file whose axes run the other way.
+        swap_xy: exchange x and y, before any flip.
+        scan_order: order of acquisition over the file's own two scan axes: ``raster`` (last axis fastest), ``serpentine``
+            (the same, every second line backwards), ``columns`` (first axis fastest), or each spot's rank in the file's order.
+        exposure_s: exposure per spot, s.
+        raw_scale: whether a y-tal file carries the factor π·cosθ_l/d_l² of an unmodified ``tal render``.
+
+    Raises:
+        CaptureError: a value cannot be what it stands for.
+    """
+
+    bin_width_ps: float | None = None
+    wall_size: float | tuple[float, float] | None = None
+    t_start: float | None = None
+    gate: tuple[int, int] | None = None
+    flip_x: bool | None = None
+    flip_y: bool | None = None
+    swap_xy: bool | None = None
+    scan_order: str | np.ndarray | None = None
+    exposure_s: float | None = None
+    raw_scale: bool | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("bin_width_ps", "exposure_s"):
+            _positive(name, getattr(self, name))
+        sides = self.wall_size if isinstance(self.wall_size, tuple | list) else (self.wall_size, self.wall_size)
+        if len(sides) != 2:
+            raise CaptureError(f"wall_size must be one length in metres or (x, y); found {self.wall_size!r}")
+        for side in sides:
+            _positive("wall_size", side)
+        if self.t_start is not None and not math.isfinite(self.t_start):
+            raise CaptureError(f"t_start must be a path length in metres; found {self.t_start!r}")
+        if self.gate is not None and len(self.gate) != 2:
+            raise CaptureError(f"gate must be (first bin, last bin); found {self.gate!r}")
+
+    @property
+    def given(self) -> dict[str, object]:
+        """Only what was said, by name."""
+        pairs = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
+        return {name: value for name, value in pairs if value is not None}
+
+    @property
+    def wall_sides(self) -> tuple[float, float] | None:
+        """``wall_size`` as (x, y), m."""
+        if self.wall_size is None:
+            return None
+        return tuple(self.wall_size) if isinstance(self.wall_size, tuple | list) else (self.wall_size, self.wall_size)
+
+
+def _positive(name: str, value: float | None) -> None:
+    if value is not None and not (math.isfinite(value) and value > 0):
+        raise CaptureError(f"{name} must be a positive number; found {value!r}")

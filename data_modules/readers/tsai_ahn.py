@@ -1,0 +1,148 @@
+"""MATLAB captures of the CMU group: Ahn et al. (ICCV 2019) ``NLOSDATA``; Tsai et al. (CVPR 2019) ``transient`` + ``lighting``;
+and plain ``meas`` cubes in MATLAB v5 files, which say nothing about their units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from data_modules.readers.assemble import (
+    COMMON_OPTIONS,
+    assemble,
+    bin_length_of,
+    cell_centres,
+    grid_of,
+    wall_points,
+)
+from data_modules.readers.contents import Contents, open_contents
+from data_modules.readers.options import ReaderOptions
+from nlos_lit.capture import Capture
+from nlos_lit.errors import CaptureError
+
+NAME = "tsai_ahn"
+DESCRIPTION = "Tsai / Ahn .mat: delta (m) and points from NLOSDATA; other forms need bin_width_ps, and meas also wall_size"
+EXPECTS = "NLOSDATA, or transient [S, T] with lighting [S, 3], or meas [x, y, T] in a MATLAB v5 file"
+OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
+
+
+def matches(contents: Contents) -> bool:
+    if "NLOSDATA.transient" in contents:
+        return True
+    if contents.ndim("transient") == 2 and contents.ndim("lighting") == 2:
+        return True
+    return contents.container == "mat5" and contents.ndim("meas") == 3
+
+
+def read(path: Path, options: ReaderOptions) -> Capture:
+    contents = open_contents(path)
+    if "NLOSDATA.transient" in contents:
+        return _read_struct(path, contents, options)
+    if "transient" in contents:
+        return _read_list(path, contents, options)
+    return _read_cube(path, contents, options)
+
+
+def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
+    """The hidden object is at the file's origin and the wall at z = target_dist: a half turn about y brings it to our frame."""
+    laser, sensor = _points(contents, "NLOSDATA.l"), _points(contents, "NLOSDATA.s")
+    distance = contents.scalar("NLOSDATA.target_dist") if "NLOSDATA.target_dist" in contents else float(laser[:, 2].mean())
+    length = bin_length_of(options.bin_width_ps) if options.bin_width_ps else contents.scalar("NLOSDATA.delta")
+    confocal = bool(contents.scalar("NLOSDATA.is_confocal")) if "NLOSDATA.is_confocal" in contents else False
+    data = contents.read("NLOSDATA.transient")
+    spots, shape = (len(laser), None) if confocal else (len(laser) * len(sensor), None)
+    counts = data.reshape(-1, data.shape[-1]) if data.ndim in (2, 3) else data
+    if counts.ndim != 2 or len(counts) != spots:
+        raise CaptureError(
+            f"NLOSDATA.transient in {path.name} is {data.shape}; expected {spots} transients for {len(laser)} laser and "
+            f"{len(sensor)} sensor points"
+        )
+    laser, sensor = (np.stack([-p[:, 0], p[:, 1], distance - p[:, 2]], axis=1) for p in (laser, sensor))
+    order = np.arange(spots)
+    if confocal:
+        sensor = laser
+        found = grid_of(laser)
+        if found is not None:
+            order, shape = found
+    else:
+        grids = grid_of(laser), grid_of(sensor)
+        if all(grids):
+            (lasers, a), (sensors, b) = grids
+            order = (lasers[:, None] * len(sensor) + sensors).ravel()
+            shape = (*a, *b) if len(laser) > 1 and len(sensor) > 1 else (b if len(laser) == 1 else a)
+        laser, sensor = np.repeat(laser, len(sensor), axis=0), np.tile(sensor, (len(laser), 1))
+    return assemble(
+        path,
+        NAME,
+        options,
+        counts=counts[order],
+        laser=laser[order],
+        sensor=sensor[order],
+        bin_length=length,
+        shape=shape,
+        listed=order,
+        steps=[f"NLOSDATA: bins of {length:g} m, wall at {distance:g} m from the file's origin, turned about y"],
+    )
+
+
+def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
+    """Confocal points in the wall plane z = 0, x and y as they are; LCT data re-saved in this form have 4 ps bins."""
+    _ask(path, options, "bin_width_ps")
+    if options.wall_size is not None:
+        raise CaptureError(f"wall_size has no meaning for {path.name}: its lighting array gives each wall point")
+    points = _points(contents, "lighting")
+    counts = contents.read("transient")
+    if counts.ndim != 2 or len(counts) != len(points):
+        raise CaptureError(f"transient in {path.name} is {counts.shape}; expected [{len(points)}, T], one row a lighting point")
+    order, shape = grid_of(points) or (np.arange(len(points)), None)
+    return assemble(
+        path,
+        NAME,
+        options,
+        counts=counts[order],
+        laser=points[order],
+        sensor=points[order],
+        bin_length=bin_length_of(options.bin_width_ps),
+        shape=shape,
+        listed=order,
+        steps=[f"bins of {options.bin_width_ps:g} ps as asked"],
+    )
+
+
+def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
+    """First axis along -x, second along +y, both as in the reconstructions published from these files."""
+    contents.require("meas")
+    if contents.ndim("meas") != 3:
+        raise CaptureError(f"meas in {path.name} must be [x, y, bins]; found {contents.entries['meas'].shape}")
+    _ask(path, options, "bin_width_ps", "wall_size")
+    data = contents.read("meas")
+    nx, ny, bins = data.shape
+    sides = options.wall_sides
+    points = wall_points(-cell_centres(nx, sides[0]), cell_centres(ny, sides[1]), "xy")
+    return assemble(
+        path,
+        NAME,
+        options,
+        counts=data.reshape(nx * ny, bins),
+        laser=points,
+        sensor=points,
+        bin_length=bin_length_of(options.bin_width_ps),
+        shape=(nx, ny),
+        steps=[f"bins of {options.bin_width_ps:g} ps, wall {sides[0]:g} m × {sides[1]:g} m as asked"],
+    )
+
+
+def _points(contents: Contents, name: str) -> np.ndarray:
+    points = contents.read(name).astype(np.float64)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
+        raise CaptureError(f"{name} in {contents.path.name} must be finite points [N, 3]; found shape {points.shape}")
+    return points
+
+
+def _ask(path: Path, options: ReaderOptions, *names: str) -> None:
+    missing = [name for name in names if getattr(options, name) is None]
+    if missing:
+        raise CaptureError(
+            f"{path.name} does not say {' and '.join(missing)}; give {'them' if len(missing) > 1 else 'it'} as reader options "
+            "(f-k migration data re-saved as MATLAB v5 are read with format fk)"
+        )
