@@ -87,7 +87,7 @@ def march(
     threshold: float,
     step: float,
     reach: float,
-    chunk: int = 4_000_000,
+    chunk: int = 1 << 20,
 ) -> Samples:
     """Find, on every ray that meets the threshold, the samples within ``reach`` of the ray's largest intensity.
 

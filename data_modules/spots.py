@@ -1,0 +1,133 @@
+"""Batches of spots: which are held out, which come in which iteration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import lightning as L
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from nlos_lit.capture import Capture
+from nlos_lit.errors import UserError
+
+
+def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
+    """``[S]`` True where a spot is held out: every ``every``-th ``block × block`` patch of the wall, patches staggered row by row.
+
+    Contiguous patches, because random spots would leak through their neighbours. Without a scanned grid, runs of ``block²``
+    neighbouring rows of the capture take the place of patches. ``every = 0`` holds out nothing.
+    """
+    if every == 0:
+        return np.zeros(capture.n_spots, dtype=bool)
+    if block < 1 or every < 2:
+        raise UserError(f"heldout.block must be at least 1 and heldout.every 0 or at least 2; found {block} and {every}")
+    if capture.scan_shape is None:
+        patch = np.arange(capture.n_spots) // block**2
+    else:
+        nx, ny = capture.scan_shape[-2:]
+        patch = np.arange(nx)[:, None] // block + 2 * (np.arange(ny) // block)
+        patch = np.broadcast_to(patch.reshape(-1), (capture.n_spots // (nx * ny), nx * ny)).reshape(-1)
+    held = patch % every == every - 1
+    if not held.any() or held.all():
+        raise UserError(
+            f"heldout.block={block}, heldout.every={every} hold out {int(held.sum())} of {capture.n_spots} spots; "
+            "choose smaller blocks, or heldout.every=0 to train on all"
+        )
+    return held
+
+
+class SpotDataset(Dataset):
+    """Row ``s`` is spot ``s`` with its gated counts ``[T]`` as float32."""
+
+    def __init__(self, capture: Capture) -> None:
+        self.counts = torch.from_numpy(capture.gated_counts())
+
+    def __len__(self) -> int:
+        return len(self.counts)
+
+    def __getitems__(self, spots: list[int]) -> dict[str, torch.Tensor]:
+        index = torch.tensor(spots)
+        return {"spots": index, "counts": self.counts[index]}
+
+
+class SpotSchedule(Sampler[list[int]]):
+    """One batch an epoch, from a rolling random permutation of ``spots``: a function of the epoch alone.
+
+    Every rank takes its share of the same batch, so the ranks together see what one process would.
+    """
+
+    def __init__(self, spots: np.ndarray, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> None:
+        if batch % ranks:
+            raise UserError(f"a batch of {batch} spots cannot be shared evenly by {ranks} processes; choose a multiple of {ranks}")
+        self.spots, self.batch, self.seed = spots, min(batch, len(spots) // ranks * ranks), seed
+        self.rank, self.ranks, self.epoch = rank, ranks, 0
+
+    def set_epoch(self, epoch: int) -> None:
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return 1
+
+    def __iter__(self) -> Iterator[list[int]]:
+        per_pass = len(self.spots) // self.batch
+        turn, place = divmod(self.epoch, per_pass)
+        order = np.random.default_rng([self.seed, turn]).permutation(self.spots)
+        chosen = order[place * self.batch : (place + 1) * self.batch]
+        yield chosen[self.rank :: self.ranks].tolist()
+
+
+class SpotBatches(Sampler[list[int]]):
+    """All of ``spots`` once, in order, in batches; every ``ranks``-th batch for this rank."""
+
+    def __init__(self, spots: np.ndarray, batch: int, rank: int = 0, ranks: int = 1) -> None:
+        self.batches = [spots[i : i + batch].tolist() for i in range(0, len(spots), batch)][rank::ranks]
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return iter(self.batches)
+
+
+class CaptureDataModule(L.LightningDataModule):
+    """Training batches and held-out spots of one capture.
+
+    Args:
+        batch: spots an iteration, over all ranks together.
+        block, every: of :func:`heldout_mask`.
+        monitor_spots: held-out spots scored while training; all of them are scored before and after.
+        seed: of the schedule.
+    """
+
+    def __init__(self, capture: Capture, *, batch: int, block: int, every: int, monitor_spots: int, seed: int) -> None:
+        super().__init__()
+        self.capture, self.batch, self.seed = capture, batch, seed
+        self.dataset = SpotDataset(capture)
+        held = heldout_mask(capture, block, every)
+        self.train_spots = np.flatnonzero(~held)
+        self.heldout_spots = np.flatnonzero(held if every else ~held)
+        rng = np.random.default_rng(seed)
+        self.monitored = np.sort(rng.permutation(self.heldout_spots)[:monitor_spots])
+        self.reference = np.sort(rng.permutation(self.train_spots)[:monitor_spots])
+
+    def _loader(self, sampler: Sampler) -> DataLoader:
+        return DataLoader(self.dataset, batch_sampler=sampler, collate_fn=lambda batch: batch)
+
+    def _place(self) -> tuple[int, int]:
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
+
+    def train_dataloader(self) -> DataLoader:
+        return self._loader(SpotSchedule(self.train_spots, self.batch, self.seed, *self._place()))
+
+    def val_dataloader(self) -> DataLoader:
+        return self._loader(SpotBatches(self.monitored, self.batch, *self._place()))
+
+    def heldout_dataloader(self) -> DataLoader:
+        """All held-out spots, this rank's share; every spot where nothing is held out."""
+        return self._loader(SpotBatches(self.heldout_spots, self.batch, *self._place()))
+
+    def reference_dataloader(self) -> DataLoader:
+        """Fixed training spots, for a loss that can be compared between iterations."""
+        return self._loader(SpotBatches(self.reference, self.batch, *self._place()))

@@ -1,0 +1,56 @@
+"""What all commands share: errors as sentences, results that are not overwritten, the folder of a run."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from nlos_lit.errors import UserError
+
+
+def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
+    """Print a :class:`UserError` as one sentence and exit with status 2; anything else keeps its traceback."""
+
+    @functools.wraps(task)
+    def wrapped(*args: Any, **kwargs: Any) -> Any:
+        try:
+            return task(*args, **kwargs)
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+
+    return wrapped
+
+
+def refuse_finished_folder(arguments: list[str]) -> None:
+    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and nothing is resumed."""
+    given = dict(item.split("=", 1) for item in arguments if "=" in item)
+    folder = given.get("hydra.run.dir")
+    if folder is not None and (Path(folder) / "summary.json").exists() and "ckpt_path" not in given:
+        print(
+            f"error: {folder} already holds a finished run (summary.json); choose another hydra.run.dir, "
+            "or ckpt_path=last to go on from it",
+            file=sys.stderr,
+        )
+        sys.exit(2)
+
+
+def write_config(config: Any, folder: Path) -> dict[str, Any]:
+    """Resolve the config, keep it as ``config.yaml`` in the run's folder, return it as plain containers."""
+    resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(resolved)))
+    return resolved
+
+
+def quiet_libraries() -> None:
+    """Silence advice that does not apply here (one epoch is one iteration; a batch is gathered, not loaded)."""
+    warnings.filterwarnings("ignore", ".*does not have many workers.*")
+    warnings.filterwarnings("ignore", ".*The number of training batches.*")
+    warnings.filterwarnings("ignore", ".*Checkpoint directory .* exists and is not empty.*")

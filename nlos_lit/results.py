@@ -1,0 +1,80 @@
+"""What a finished run leaves in its folder."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from nlos_lit import figures
+from nlos_lit.callbacks import History, run_figures, surface_points
+from nlos_lit.export import write_json, write_points, write_volume
+from nlos_lit.geometry_metrics import depth_map, geometry_errors
+from nlos_lit.mesh import write_mesh
+from nlos_lit.runs import Run
+from nlos_lit.summary import build_summary
+
+log = logging.getLogger(__name__)
+
+
+def shown_spots(n_spots: int, count: int) -> np.ndarray:
+    """``count`` spots spread over the scan along a golden-ratio sequence (no row or column is favoured)."""
+    golden = (np.arange(1, count + 1) * 0.6180339887498949) % 1.0
+    return np.unique((golden * n_spots).astype(np.int64))
+
+
+def write_results(run: Run, history: History, folder: Path, total_seconds: float) -> dict[str, Any]:
+    """Volume, points, mesh, figures and ``summary.json``; returns the summary."""
+    module, capture, config = run.module, run.capture, run.config
+    pipeline = module.pipeline
+    with torch.no_grad():
+        volume = pipeline.phasor()
+        albedo = pipeline.albedo(volume)
+    grid = pipeline.phasor.grid
+    write_volume(folder / "volume.h5", volume.cpu().numpy(), grid, albedo=albedo.cpu().numpy())
+    points = surface_points(module, shown_spots(capture.n_spots, config["export"]["spots"]))
+    write_points(folder / "points.ply", points)
+    mesh = write_mesh(folder / "mesh.ply", points, depth=config["export"]["mesh_depth"])
+    if mesh.reason:
+        log.warning("mesh.ply: %s", mesh.reason)
+    geometry = None
+    shown = run_figures(module, capture, shown_spots(capture.n_spots, config["monitor"]["spots"]))
+    if run.truth is not None and len(points):
+        spacing = float(np.abs(grid.pitch[:2]).max())
+        geometry = geometry_errors(points, run.truth, lateral_tolerance=spacing).to_dict()
+        x, y = run.truth.x, run.truth.y
+        shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)
+    parameters = module.imaging_parameters()
+    loss = {name.removeprefix("loss/"): values for name, values in history.values.items() if name.startswith("loss/")}
+    track = {name.removeprefix("parameters/"): v for name, v in history.values.items() if name.startswith("parameters/")}
+    if loss:
+        shown["loss"] = figures.loss_plot(loss)
+        shown["parameters"] = figures.parameter_plot(track, {name: entry["unit"] for name, entry in parameters.items()})
+    for name, figure in shown.items():
+        figures.save_figure(figure, folder / "figures" / f"{name}.png")
+    first, last = module.scores["initial"], module.scores["final"]
+    summary = build_summary(
+        scene=config["scene"]["name"],
+        seed=config["seed"],
+        loss=(first["loss"], last["loss"]),
+        nmse=(first["nmse"], last["nmse"], last["nmse_noise_floor"]),
+        deviance_per_bin=(first["deviance_per_bin"], last["deviance_per_bin"], last["deviance_noise"]),
+        parameters={name: (entry["value"], entry["unit"]) for name, entry in parameters.items()},
+        seconds=(run.setup_seconds, float(np.median(history.seconds)) if history.seconds else float("nan"), total_seconds),
+        geometry=geometry,
+        transient_mse={
+            "train": {"initial": first["train_mse"], "final": last["train_mse"]},
+            "heldout": {"initial": first["mse"], "final": last["mse"]},
+        },
+        iterations=len(history.seconds),
+        ablation=config["ablation"]["name"],
+        optimised=module.optimised,
+        estimated_memory_bytes=run.estimated_bytes,
+        mesh={"vertices": mesh.vertices, "triangles": mesh.triangles, "reason": mesh.reason},
+        capture={"kind": capture.kind, "spots": capture.n_spots, "bins": capture.n_bins, "provenance": capture.provenance},
+    )
+    write_json(folder / "summary.json", summary)
+    return summary

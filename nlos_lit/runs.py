@@ -1,0 +1,132 @@
+"""A run, from config to results: built by ``train.py``, opened again by later commands."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+
+from data_modules.scenes import load_scene
+from data_modules.spots import CaptureDataModule
+from nlos_lit.build import PipelineSettings, build_pipeline, match_energy, normalisation
+from nlos_lit.capture import Capture
+from nlos_lit.errors import UserError
+from nlos_lit.geometry_metrics import SurfaceTruth
+from nlos_lit.memory import check_machine, parse_bytes
+from nlos_lit.module import SelfCalibration
+from nlos_lit.progress import planes_progress
+from nlos_lit.scan import volume_grid
+
+log = logging.getLogger(__name__)
+
+_MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_planes")
+
+
+@dataclass
+class Run:
+    """A capture with the module that is fitted to it."""
+
+    config: dict[str, Any]
+    capture: Capture
+    truth: SurfaceTruth | None
+    data: CaptureDataModule
+    module: SelfCalibration
+    setup_seconds: float
+    estimated_bytes: int
+
+
+def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -> Run:
+    """Everything before the first iteration: capture, volume, memory estimate, propagated phasor field, start values.
+
+    Raises:
+        UserError: the data, the geometry or the settings cannot work; nothing has been written then.
+    """
+    began = time.perf_counter()
+    scene, seed = config["scene"], int(config["seed"])
+    capture, truth = load_scene(scene, config["data_dir"], seed)
+    grid = volume_grid(capture, **scene["volume"])
+    data = CaptureDataModule(
+        capture,
+        batch=config["batch_spots"],
+        block=config["heldout"]["block"],
+        every=config["heldout"]["every"],
+        monitor_spots=config["heldout"]["monitor_spots"],
+        seed=seed,
+    )
+    settings = {name: value for name, value in config["model"].items() if name not in _MODULE_KEYS}
+    pipeline = build_pipeline(capture, grid, PipelineSettings(**settings)).to(device)
+    plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]))
+    rays = settings["rays"] ** 2 * config["batch_spots"]
+    # Albedo with its gradient and Adam's two moments; dense ray tables; the march's chunk of samples.
+    estimated = plan.total_bytes + 16 * grid.n_voxels + 24 * rays + 600 * 2**20
+    check_machine(estimated, "this run")
+    log.info(
+        "%s: %d spots x %d bins of %.3g ps, %s; volume %d x %d x %d voxels, depth %.3g to %.3g m",
+        scene["name"], capture.n_spots, capture.n_bins, capture.bin_width_ps, capture.kind, *grid.shape[1:], grid.shape[0],
+        grid.z[0], grid.z[-1],
+    )  # fmt: skip
+    log.info("%s; about %.1f GiB in all", plan, estimated / 2**30)
+    imaged = None if config["heldout"]["imaging"] else data.train_spots
+    with planes_progress("propagating the phasor field") as progress:
+        pipeline.phasor.prepare(capture, plan, spots=imaged, progress=progress)
+    start = np.random.default_rng([seed, 1]).permutation(data.train_spots)[: config["batch_spots"] * 2]
+    match_energy(pipeline, capture, torch.from_numpy(np.sort(start)).to(device))
+    model, optimise = config["model"], config["ablation"]["optimise"]
+    module = SelfCalibration(
+        pipeline,
+        normalisation(capture),
+        optimise=optimise,
+        rates=model["rates"],
+        lambda_sparsity=model["lambda_sparsity"],
+        lambda_albedo=model["lambda_albedo"],
+        albedo_planes=model["albedo_planes"],
+        clip=model["clip"],
+        seed=seed,
+    )
+    return Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated)
+
+
+def open_run(folder: str | Path) -> Run:
+    """A finished run as its folder holds it: resolved config, capture, fitted module.
+
+    Raises:
+        UserError: the folder is not a run, or has no checkpoint.
+    """
+    folder = Path(folder)
+    config_file, checkpoint = folder / "config.yaml", folder / "checkpoints" / "last.ckpt"
+    for needed in (config_file, checkpoint):
+        if not needed.exists():
+            raise UserError(f"{folder} is not the folder of a finished run: {needed.relative_to(folder)} is missing")
+    run = prepare_run(OmegaConf.to_container(OmegaConf.load(config_file)))
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    run.module.load_state_dict(state["state_dict"])
+    run.module.scores = state["scores"]
+    return run
+
+
+def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | None:
+    """The checkpoint file to go on from; ``last`` is that of ``folder``, else of the scene's newest run beside it.
+
+    Raises:
+        UserError: there is none.
+    """
+    if ckpt_path is None:
+        return None
+    if ckpt_path != "last":
+        if not Path(ckpt_path).is_file():
+            raise UserError(f"ckpt_path={ckpt_path} does not exist; give a checkpoint file or ckpt_path=last")
+        return Path(ckpt_path)
+    own = folder / "checkpoints" / "last.ckpt"
+    if own.exists():
+        return own
+    others = sorted(folder.parent.glob("*/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
+    if not others:
+        raise UserError(f"ckpt_path=last: neither {folder} nor another run of '{scene}' beside it has checkpoints/last.ckpt")
+    return others[-1]

@@ -1,0 +1,66 @@
+"""One table of a multirun: a row a job, as CSV and Markdown."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig
+
+log = logging.getLogger(__name__)
+
+COLUMNS = {
+    "scene": ("scene",),
+    "ablation": ("ablation",),
+    "seed": ("seed",),
+    "MSE transient (held out)": ("transient_mse", "heldout", "final"),
+    "MSE transient (train)": ("transient_mse", "train", "final"),
+    "NMSE": ("heldout", "nmse", "final"),
+    "NMSE noise": ("heldout", "nmse", "noise_floor"),
+    "deviance/bin": ("heldout", "deviance_per_bin", "final"),
+    "s/iteration": ("seconds", "per_iteration"),
+}
+
+
+class SweepTable(Callback):
+    """Hydra callback: after a multirun, ``table.csv`` and ``table.md`` in the sweep's folder."""
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        folder = Path(config.hydra.sweep.dir)
+        rows = sweep_rows(folder)
+        if rows:
+            write_table(folder, rows)
+            log.info("the sweep's table is %s", folder / "table.md")
+
+
+def sweep_rows(folder: Path) -> list[dict[str, Any]]:
+    """A row per ``*/summary.json`` below ``folder``, best held-out error last, as in the paper's Table 1."""
+    rows = []
+    for path in sorted(folder.glob("*/summary.json")):
+        summary = json.loads(path.read_text())
+        row: dict[str, Any] = {}
+        for column, keys in COLUMNS.items():
+            value: Any = summary
+            for key in keys:
+                value = value[key]
+            row[column] = value
+        rows.append(row)
+    return sorted(rows, key=lambda row: -row["MSE transient (held out)"])
+
+
+def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
+    with (folder / "table.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+    def cell(value: Any) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
+    lines += ["| " + " | ".join(cell(v) for v in row.values()) + " |" for row in rows]
+    (folder / "table.md").write_text("\n".join(lines) + "\n")

@@ -1,0 +1,76 @@
+"""Reconstruct a hidden scene by self-calibration: ``python train.py scene=su``."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from pathlib import Path
+
+import hydra
+import lightning as L
+import torch
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import TensorBoardLogger
+from omegaconf import DictConfig
+
+from nlos_lit.callbacks import Bar, Figures, History, Scores
+from nlos_lit.command import quiet_libraries, refuse_finished_folder, sentence_errors, write_config
+from nlos_lit.results import shown_spots, write_results
+from nlos_lit.runs import find_checkpoint, prepare_run
+
+log = logging.getLogger(__name__)
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="train")
+@sentence_errors
+def main(config: DictConfig) -> None:
+    began = time.perf_counter()
+    quiet_libraries()
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    checkpoint = find_checkpoint(config.ckpt_path, folder, config.scene.name)
+    settings = write_config(config, folder)
+    L.seed_everything(settings["seed"], verbose=False)
+    if settings["trainer"]["threads"]:
+        torch.set_num_threads(settings["trainer"]["threads"])
+    device = "cuda" if settings["trainer"]["accelerator"] == "gpu" else "cpu"
+    run = prepare_run(settings, device)
+    monitor, history = settings["monitor"], History()
+    trainer = L.Trainer(
+        accelerator=settings["trainer"]["accelerator"],
+        devices=settings["trainer"]["devices"],
+        strategy=settings["trainer"]["strategy"],
+        max_epochs=settings["scene"]["iterations"],
+        check_val_every_n_epoch=monitor["every"],
+        log_every_n_steps=1,
+        num_sanity_val_steps=0,
+        use_distributed_sampler=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        logger=TensorBoardLogger(folder, name="", version="tensorboard") if settings["logger"]["tensorboard"] else False,
+        callbacks=[
+            Scores(),
+            history,
+            Bar(),
+            Figures(monitor["figures_every"], shown_spots(run.capture.n_spots, monitor["spots"])),
+            ModelCheckpoint(folder / "checkpoints", save_last=True, every_n_epochs=monitor["checkpoint_every"], filename="iteration"),
+        ],
+    )
+    trainer.fit(run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None)
+    if trainer.interrupted:
+        log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", settings["scene"]["name"], folder)
+        sys.exit(130)
+    if not trainer.is_global_zero:
+        return
+    summary = write_results(run, history, folder, time.perf_counter() - began)
+    nmse = summary["heldout"]["nmse"]
+    log.info(
+        "held-out NMSE %.4f -> %.4f (noise %.4f), loss %.3e -> %.3e; results in %s",
+        nmse["initial"], nmse["final"], nmse["noise_floor"], summary["loss"]["initial"], summary["loss"]["final"], folder,
+    )  # fmt: skip
+
+
+if __name__ == "__main__":
+    refuse_finished_folder(sys.argv[1:])
+    main()
