@@ -1,6 +1,7 @@
 """Hidden scenes without downloads: plates, spheres, strokes, and the embedded default scene.
 
-Everything faces the wall (normals towards -z) unless turned; x to the right, y up, metres.
+Everything faces the wall (normals towards -z) unless turned. Letters read rightly in a plot with x to the right and y up, which is
+the view of the wall from behind the scene.
 """
 
 from __future__ import annotations

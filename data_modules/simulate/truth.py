@@ -23,7 +23,7 @@ class Truth:
         depth: ``[nx, ny]`` z of the first surface along +z, m.
         normal: ``[nx, ny, 3]`` its unit normal, on the side seen from the wall.
         albedo: ``[nx, ny]`` its reflectance; 0 where the black back of a one-sided face is seen.
-        mesh: the surface itself.
+        mesh: the surface itself, None where only the view of it is known.
         clean: ``[S, T]`` radiance per bin and laser power before the sensor, where asked for.
         expected: ``[S, T]`` expected counts (response, exposure and background in), where asked for.
         gain: counts per unit of ``clean``.
@@ -34,7 +34,7 @@ class Truth:
     depth: np.ndarray
     normal: np.ndarray
     albedo: np.ndarray
-    mesh: Mesh
+    mesh: Mesh | None = None
     clean: np.ndarray | None = None
     expected: np.ndarray | None = None
     gain: float | None = None
@@ -66,18 +66,14 @@ def save_truth(path: str | Path, truth: Truth) -> None:
             values = getattr(truth, name)
             if values is not None:
                 file.create_dataset(name, data=values.astype(np.float32), compression="gzip")
-        for name in ("vertices", "faces", "albedo"):
+        for name in ("vertices", "faces", "albedo") if truth.mesh is not None else ():
             file.create_dataset(f"mesh/{name}", data=getattr(truth.mesh, name), compression="gzip")
         if truth.gain is not None:
             file["gain"] = truth.gain
 
 
-def load_truth(path: str | Path, mesh: Mesh | None = None) -> Truth:
+def load_truth(path: str | Path) -> Truth:
     """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y`` (nothing there: -1 or NaN).
-
-    Args:
-        path: HDF5 file.
-        mesh: the surface, for files that do not hold it.
 
     Raises:
         UserError: no such file, not HDF5, or a key is missing.
@@ -89,16 +85,14 @@ def load_truth(path: str | Path, mesh: Mesh | None = None) -> Truth:
         raise UserError(f"{path} is not an HDF5 file; ground truth is HDF5 with depth, normal, x and y")
     with h5py.File(path, "r") as file:
         missing = [name for name in ("x", "y", "depth", "normal") if name not in file]
-        if missing or (mesh is None and "mesh" not in file):
-            lacks = ", ".join(missing) or "a mesh (give one)"
-            raise UserError(f"{path} lacks {lacks}; ground truth holds depth, normal, x, y and mesh")
+        if missing:
+            raise UserError(f"{path} lacks {', '.join(missing)}; ground truth holds depth, normal, x and y")
         data = {name: file[name][()].astype(np.float64) for name in ("x", "y", "depth", "normal")}
         nothing = ~(data["depth"] > 0)
         data["depth"][nothing] = np.nan
         data["normal"][nothing] = np.nan
         albedo = file["albedo"][()].astype(np.float64) if "albedo" in file else np.where(nothing, np.nan, 1.0)
-        if mesh is None:
-            mesh = Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo")))
+        mesh = Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo"))) if "mesh" in file else None
         truth = Truth(**data, albedo=albedo, mesh=mesh)
         extra = {name: file[name][()] for name in ("clean", "expected") if name in file}
         return replace(truth, **extra, gain=float(file["gain"][()]) if "gain" in file else None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import h5py
 import numpy as np
 import pytest
 
@@ -151,6 +152,10 @@ def test_truth_files_that_cannot_be_read_say_why(tmp_path):
     (tmp_path / "text.h5").write_text("depth")
     with pytest.raises(UserError, match="not an HDF5 file"):
         load_truth(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "half.h5", "w") as file:
+        file["x"] = file["y"] = file["depth"] = np.zeros(3)
+    with pytest.raises(UserError, match="lacks normal"):
+        load_truth(tmp_path / "half.h5")
 
 
 def test_meshes_face_the_wall_and_close_where_they_should():

@@ -14,7 +14,7 @@ from data_modules.simulate.transients import simulate_transients
 from data_modules.simulate.truth import load_truth, view_from_wall
 
 RENDERS = [
-    # file, mesh, every n-th spot, relative excess over the stated noise that is allowed
+    # file, mesh, every n-th spot
     ("z_confocal_64_d3", "z", 7),
     ("z_single_32_d3", "z", 3),
     ("z_exhaustive_8x8x8x8_d3", "z", 5),
@@ -67,7 +67,7 @@ def test_a_transposed_scan_would_be_noticed():
 @pytest.mark.parametrize("name", ["z", "bunny", "sphereplate"])
 def test_the_view_from_the_wall_is_the_given_truth(name):
     mesh = scene(name)
-    given = load_truth(real_file(f"rendered/{name}_gt.h5"), mesh)
+    given = load_truth(real_file(f"rendered/{name}_gt.h5"))
     seen = view_from_wall(mesh, given.x, given.y)
     both = np.isfinite(seen.depth) & np.isfinite(given.depth)
     # Pixels whose ray grazes the outline may differ; a sphere of facets is a little smaller than the sphere.
