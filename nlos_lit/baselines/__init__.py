@@ -13,8 +13,8 @@ from typing import Any
 import torch
 
 from nlos_lit.baselines.backprojection import bp, bp_bytes, fbp, fbp_bytes
-from nlos_lit.baselines.fk import fk, fk_bytes
-from nlos_lit.baselines.lct import lct, lct_bytes
+from nlos_lit.baselines.light_cone import lct, lct_bytes
+from nlos_lit.baselines.migration import fk, fk_bytes
 from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError, UserError
 from nlos_lit.grid import VolumeGrid

@@ -6,6 +6,8 @@ equal path runs through it; a Laplacian then removes the blur that the overlap o
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,8 +17,9 @@ from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
 
-_BLOCK = 1 << 19  # (spot, voxel) pairs at a time: six float32 arrays of this size fit the caches and bound the memory
-_TABLE = 1 << 23  # distances (wall point, voxel) kept at a time
+_BLOCK = 1 << 19  # (spot, voxel) pairs at a time: they bound the memory, and few calls are made
+_SCRATCH = 64 << 20  # bytes that the allocator and the libraries were seen to keep besides
+_TABLE = 1 << 22  # distances from wall points to voxels kept at a time
 
 
 def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Tensor:
@@ -35,33 +38,33 @@ def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Ten
     """
     _, longest = path_range(capture, grid)
     transients, start = gated_transients(capture, longest, falloff)
-    lasers, laser_of = np.unique(capture.laser, axis=0, return_inverse=True)
-    sensors, sensor_of = np.unique(capture.sensor, axis=0, return_inverse=True)
-    confocal = capture.confocal
-    # grid_sample wants positions in [-1, 1] between the outer bin edges
+    # grid_sample takes positions in [-1, 1] between the outer edges of the bins
     scale = 2 / (transients.shape[1] * capture.bin_length)
     shift = -start * scale - 1
+    ends = _path_ends(capture)
     nz, nx, ny = grid.shape
-    voxels = _block_voxels(grid, len(sensors) + (0 if confocal else len(lasers)))
-    spots = max(1, _BLOCK // voxels)
-    where = torch.zeros(min(spots, capture.n_spots), 1, voxels, 2)
-    volume = torch.empty(grid.n_voxels)
-    laser_of, sensor_of = (torch.from_numpy(index.reshape(-1)) for index in (laser_of, sensor_of))
-    for begin in range(0, grid.n_voxels, voxels):
-        flat = np.arange(begin, min(begin + voxels, grid.n_voxels))
-        centres = np.stack([grid.x[flat // ny % nx], grid.y[flat % ny], grid.z[flat // (nx * ny)]])
-        to_sensor = _distances(sensors, centres).mul_(2 * scale if confocal else scale).add_(shift)
-        to_laser = None if confocal else _distances(lasers, centres).mul_(scale)
-        total = torch.zeros(len(flat))
-        for s in range(0, capture.n_spots, spots):
-            chunk = slice(s, min(s + spots, capture.n_spots))
-            position = where[: chunk.stop - s, :, : len(flat)]
-            path = to_sensor[sensor_of[chunk]]
-            if to_laser is not None:
-                path += to_laser[laser_of[chunk]]
-            position[:, 0, :, 0] = path
-            total += F.grid_sample(transients[chunk, None, None], position, padding_mode="zeros", align_corners=False).sum((0, 1, 2))
-        volume[begin : begin + len(flat)] = total
+    lateral = np.stack([np.repeat(grid.x, ny), np.tile(grid.y, nx)], axis=1)
+    columns = _block_columns(grid, ends)
+    spots = min(capture.n_spots, max(1, _BLOCK // columns))
+    position = torch.zeros(spots, 1, columns, 2)
+    volume = torch.zeros(nz, nx * ny)
+    for begin in range(0, nx * ny, columns):
+        block = slice(begin, min(begin + columns, nx * ny))
+        width = block.stop - block.start
+        squares = [_squared_distances(end.points[:, :2], lateral[block], end.passes * scale) for end in ends]
+        paths = [torch.empty_like(square) for square in squares]
+        for k, z in enumerate(grid.z):
+            for end, square, path in zip(ends, squares, paths, strict=True):
+                torch.add(square, _squared_distances(end.points[:, 2:], np.array([[z]]), end.passes * scale), out=path).sqrt_()
+            paths[0] += shift
+            for s in range(0, capture.n_spots, spots):
+                chunk = slice(s, min(s + spots, capture.n_spots))
+                where = position[: chunk.stop - s, :, :width]
+                where[:, 0, :, 0] = paths[0][ends[0].of_spot[chunk]]
+                if len(ends) > 1:
+                    where[:, 0, :, 0] += paths[1][ends[1].of_spot[chunk]]
+                found = F.grid_sample(transients[chunk, None, None], where, padding_mode="zeros", align_corners=False)
+                volume[k, block] += found.view(-1, width).sum(0)
     return volume.view(nz, nx, ny)
 
 
@@ -101,30 +104,48 @@ def fbp(capture: Capture, grid: VolumeGrid, *, filter: str = "log", sigma: float
 
 def bp_bytes(capture: Capture, grid: VolumeGrid) -> int:
     """Bytes that :func:`bp` allocates: transients, volume, and one block of positions and distances."""
-    points = len(np.unique(capture.sensor, axis=0))
-    points += 0 if capture.confocal else len(np.unique(capture.laser, axis=0))
-    voxels = _block_voxels(grid, points)
-    pairs = max(1, min(_BLOCK // voxels, capture.n_spots)) * voxels
+    ends = _path_ends(capture)
+    columns = _block_columns(grid, ends)
+    pairs = max(1, min(_BLOCK // columns, capture.n_spots)) * columns
     transients = capture.n_spots * (capture.gate[1] - capture.gate[0])
-    return 4 * (transients + grid.n_voxels + 6 * pairs + 2 * points * voxels)
+    return _SCRATCH + 4 * (transients + grid.n_voxels + 5 * pairs + 3 * sum(len(end.points) for end in ends) * columns)
 
 
 def fbp_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`fbp` allocates: the larger of the backprojection and five volumes for its filter."""
-    return max(bp_bytes(capture, grid), 4 * 6 * grid.n_voxels)
+    """Bytes that :func:`fbp` allocates: the larger of the backprojection and the six volumes of its filter."""
+    return max(bp_bytes(capture, grid), _SCRATCH + 4 * 6 * grid.n_voxels)
 
 
-def _block_voxels(grid: VolumeGrid, points: int) -> int:
-    return max(1, min(grid.n_voxels, max(256, min(_TABLE // points, 1 << 15))))
+@dataclass(frozen=True)
+class _PathEnd:
+    """Distinct wall points at one end of the paths, which of them each spot uses, and how often the path runs to them."""
+
+    points: np.ndarray
+    of_spot: torch.Tensor
+    passes: float
 
 
-def _distances(points: np.ndarray, centres: np.ndarray) -> torch.Tensor:
-    """``[P, V]`` distances from wall ``points [P, 3]`` to voxel ``centres [3, V]``."""
-    wall, voxel = torch.from_numpy(points).float(), torch.from_numpy(centres).float()
-    squared = (wall[:, :1] - voxel[0]).square_()
-    squared += (wall[:, 1:2] - voxel[1]).square_()
-    squared += (wall[:, 2:] - voxel[2]).square_()
-    return squared.sqrt_()
+def _path_ends(capture: Capture) -> list[_PathEnd]:
+    ends = []
+    for points in (capture.sensor,) if capture.confocal else (capture.laser, capture.sensor):
+        distinct, of_spot = np.unique(points, axis=0, return_inverse=True)
+        ends.append(_PathEnd(distinct, torch.from_numpy(of_spot.reshape(-1)), 2.0 if capture.confocal else 1.0))
+    return ends
+
+
+def _block_columns(grid: VolumeGrid, ends: list[_PathEnd]) -> int:
+    """Voxels of one slice to work on at a time."""
+    return min(grid.shape[1] * grid.shape[2], max(64, _TABLE // sum(len(end.points) for end in ends)))
+
+
+def _squared_distances(points: np.ndarray, centres: np.ndarray, scale: float) -> torch.Tensor:
+    """``[P, V]`` squared distances between ``points [P, d]`` and ``centres [V, d]``, in units of ``1/scale``."""
+    a, b = torch.from_numpy(points * scale).float(), torch.from_numpy(centres * scale).float()
+    total = torch.zeros(len(a), len(b))
+    for axis in range(a.shape[1]):
+        step = a[:, axis, None] - b[:, axis]
+        total.addcmul_(step, step)
+    return total
 
 
 def _along(volume: torch.Tensor, axis: int, sigma: float, *, derivative: bool) -> torch.Tensor:

@@ -1,8 +1,8 @@
 """f-k migration: confocal transients as a wave field, carried back to the moment of its emission.
 
-Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, ACM Trans. Graph. 38, 116 (2019), after
-Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources exploding at ζ = 0 has unit speed, so that measured at the
-wall, ``Ψ(x, y, 0, ζ)``, its spectrum ``Φ(kx, ky, f)`` gives the field at ζ = 0:
+Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, ACM Trans. Graph. 38, 116 (2019),
+after Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources that explode at ζ = 0 has unit speed, and the spectrum
+``Φ(kx, ky, f)`` of what the wall receives, ``Ψ(x, y, 0, ζ)``, gives the field at ζ = 0:
 
     Ψ(x, y, z, 0) = ∭ kz/f · Φ(kx, ky, f) e^{i(kx x + ky y + kz z)} dkx dky dkz,      f = √(kx² + ky² + kz²).
 """
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from scipy.fft import next_fast_len
 
-from nlos_lit.baselines.lct import gated_bins
+from nlos_lit.baselines.light_cone import gated_bins
 from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import confocal_lattice, gated_transients, path_range
 from nlos_lit.capture import Capture
@@ -52,8 +52,8 @@ def fk(capture: Capture, grid: VolumeGrid, *, falloff: float = 4.0) -> torch.Ten
 def stolt(field: torch.Tensor, pitch: tuple[float, float], step: float, first: float) -> torch.Tensor:
     """The field at ζ = 0 from the field at the wall, by Stolt's change of variable.
 
-    Linear interpolation in ``f`` multiplies the record by sinc² of ζ over the padded length; with ζ counted from the middle of the
-    record and the record divided by that sinc² beforehand, it is accurate at every depth.
+    Interpolation in ``f`` by cubic B-splines multiplies the record by sinc⁴ of ζ over the padded length; with ζ counted from the
+    middle of the record and the record divided by that sinc⁴ beforehand, it is accurate at every depth.
 
     Args:
         field: ``[N, nx, ny]`` real samples at ``ζ = first + k·step``.
@@ -68,25 +68,31 @@ def stolt(field: torch.Tensor, pitch: tuple[float, float], step: float, first: f
     bins, nx, ny = field.shape
     size, px, py = (next_fast_len(2 * n, real=True) for n in (bins, nx, ny))
     middle = bins // 2
-    taper = torch.sinc((torch.arange(bins, dtype=torch.float64) - middle) / size).square().float()
+    taper = torch.sinc((torch.arange(bins, dtype=torch.float64) - middle) / size).pow(4).float()
     padded = torch.zeros(size, nx, ny)
     padded[: bins - middle] = field[middle:] / taper[middle:, None, None]
     padded[size - middle :] = field[:middle] / taper[:middle, None, None]
     spectrum = torch.fft.fft2(torch.fft.rfft(padded, dim=0), s=(px, py))
     del padded
-    wave = torch.fft.rfftfreq(size, step, dtype=torch.float64)
-    kx, ky = (torch.fft.fftfreq(n, d, dtype=torch.float64) for n, d in zip((px, py), pitch, strict=True))
+    kz = torch.fft.rfftfreq(size, step)[:, None, None]
+    kx, ky = (torch.fft.fftfreq(n, d) for n, d in zip((px, py), pitch, strict=True))
     origin = 2 * np.pi * (first + middle * step)
-    for i in range(px):
-        frequency = torch.sqrt(wave[:, None] ** 2 + ky**2 + kx[i] ** 2)
-        position = frequency / wave[1]
-        low = position.long().clamp_(max=len(wave) - 2)
-        share = (position - low).float()
-        row = spectrum[:, i]
-        moved = torch.lerp(row.gather(0, low), row.gather(0, low + 1), share.to(row.dtype))
-        jacobian = wave[:, None] / frequency.clamp(min=1e-30)
-        jacobian[position > len(wave) - 1] = 0
-        spectrum[:, i] = moved * torch.polar(jacobian, (wave[:, None] - frequency) * origin).to(moved.dtype)
+    last = len(kz) - 1
+    rows = _rows(len(kz), px, py)
+    for i in range(0, px, rows):
+        block = spectrum[:, i : i + rows]
+        lateral = kx[i : i + rows, None] ** 2 + ky**2
+        frequency = torch.sqrt(kz**2 + lateral).clamp_(min=1e-30)
+        position = frequency / kz[1]
+        outside = position > last + 1e-3
+        low = position.long().clamp_(max=last)
+        bounded = torch.cat([block[:1], block, block[-1:], block[-1:]])
+        moved = torch.zeros_like(block)
+        for tap, weight in enumerate(_cubic_weights(position.sub_(low))):
+            moved.addcmul_(bounded[tap : tap + len(kz)].gather(0, low), weight.to(block.dtype))
+        jacobian = (kz / frequency).masked_fill_(outside, 0)
+        phase = lateral.mul(-origin) / frequency.add_(kz)  # (kz - f)·origin, without the cancellation
+        torch.mul(moved, torch.polar(jacobian, phase), out=block)
     columns = torch.fft.ifft2(spectrum)[:, :nx, :ny]
     del spectrum
     image = torch.fft.ifft(columns, n=size, dim=0).mul_(2)
@@ -99,5 +105,20 @@ def fk_bytes(capture: Capture, grid: VolumeGrid) -> int:
     bins = gated_bins(capture, grid)
     size, px, py = (next_fast_len(2 * n, real=True) for n in (bins, *lattice.shape))
     half = size // 2 + 1
-    wide = half * px * py
-    return 8 * (2 * wide + 8 * half * py + size * capture.n_spots) + 4 * (bins * capture.n_spots + grid.n_voxels + bins * grid.shape[0])
+    block = half * py * _rows(half, px, py)
+    wide = 8 * half * px * py
+    native = bins * capture.n_spots
+    moving = max(2 * wide, 112 * block)
+    return wide + moving + 16 * size * capture.n_spots + 4 * (2 * native + grid.n_voxels + bins * grid.shape[0])
+
+
+def _cubic_weights(t: torch.Tensor) -> tuple[torch.Tensor, ...]:
+    """Cubic B-spline at the four samples around a position a fraction ``t`` past the second."""
+    near = t * t * (3 * t - 6) + 4
+    s = 1 - t
+    return s * s * s / 6, near / 6, (s * s * (3 * s - 6) + 4) / 6, t * t * t / 6
+
+
+def _rows(half: int, px: int, py: int) -> int:
+    """Rows of kx to interpolate at a time, so that one block holds at most half a million wave vectors."""
+    return max(1, min(px, (1 << 19) // (half * py)))

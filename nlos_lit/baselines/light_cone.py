@@ -87,7 +87,7 @@ def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
     bins = gated_bins(capture, grid)
     m, nx, ny = _padded((bins, *lattice.shape))
     native = bins * capture.n_spots
-    return 4 * (3 * native + 6 * m * nx * (ny + 2) + grid.n_voxels + bins * grid.shape[0])
+    return 4 * (3 * native + 4 * m * nx * (ny + 2) + grid.n_voxels + bins * grid.shape[0])
 
 
 def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
