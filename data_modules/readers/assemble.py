@@ -29,6 +29,7 @@ def assemble(
     shape: tuple[int, ...] | None,
     t_start: float = 0.0,
     gate: tuple[int, int] | None = None,
+    behind_pulse: bool = False,
     laser_normal: np.ndarray | None = None,
     sensor_normal: np.ndarray | None = None,
     is_counts: bool | None = None,
@@ -44,6 +45,7 @@ def assemble(
         counts: ``[S, T]`` in the file's order of spots.
         laser, sensor: ``[S, 3]`` wall points in the world frame, m.
         shape: scanned grid, in the file's order of axes.
+        behind_pulse: choose the gate by `gate_after_direct_pulse`, where the user gives none.
         is_counts: None to tell by whether all values are whole numbers.
         scan_order: ``[S]`` rank of each spot, where the file says it.
         listed: ``[S]`` for a file that lists its spots: the row of that list which each spot comes from.
@@ -58,12 +60,15 @@ def assemble(
         if getattr(options, name):
             vectors = [_mirror(vector, name) for vector in vectors]
             steps.append(f"{name} as asked")
-    if options.gate is not None:
-        gate = options.gate
-        steps.append(f"gate [{gate[0]}, {gate[1]}) as asked")
     if options.t_start is not None:
         t_start = options.t_start
         steps.append(f"bin 0 begins at path {t_start:g} m as asked")
+    if options.gate is not None:
+        gate = options.gate
+        steps.append(f"gate [{gate[0]}, {gate[1]}) as asked")
+    elif behind_pulse:
+        gate, told = gate_after_direct_pulse(counts, bin_length, t_start)
+        steps.append(told)
     rank = acquisition_order(options.scan_order, shape if listed is None else None, spots)
     if rank is None:
         rank = scan_order if scan_order is not None else listed
@@ -181,20 +186,24 @@ def remove_delays(counts: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, f
     """
     if not np.isfinite(delays).all() or delays.min() < 0:
         raise CaptureError("the delays to take off each spot must be finite and not negative")
+    if delays.max() >= counts.shape[1] - 0.5:
+        raise CaptureError(
+            f"delays of up to {delays.max():.0f} bins leave nothing of the file's {counts.shape[1]} bins; check the bin width"
+        )
     whole = np.rint(delays).astype(np.int64)
     left = counts.shape[1] - int(whole.max())
-    if left < 1:
-        raise CaptureError(
-            f"delays of up to {whole.max()} bins leave nothing of the file's {counts.shape[1]} bins; check the bin width"
-        )
     shifted = np.empty((counts.shape[0], left), dtype=counts.dtype)
     for delay in np.unique(whole):
         rows = whole == delay
         shifted[rows] = counts[rows, delay : delay + left]
     rest = whole - delays
     offset = float(rest.mean())
+    total = counts.sum(dtype=np.float64)
+    lost = 1 - shifted.sum(dtype=np.float64) / total if total > 0 else 0.0
+    off = np.abs(rest - offset).max()
     told = (
-        f"took {whole.min()} to {whole.max()} bins off the spots' times (whole bins; at most {np.abs(rest - offset).max():.2f} off)"
+        f"took {whole.min()} to {whole.max()} bins off the spots' times (whole bins, at most {off:.2f} off; "
+        f"{lost:.2%} of the counts fell outside the {left} bins that all spots share)"
     )
     return shifted, offset, told
 

@@ -33,17 +33,13 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     if not contents.has(*_KEYS) and contents.container != "folder":
         contents = open_folder(path.parent)
     contents.require(*_KEYS)
-    laser, sensor, counts = (contents.read(key) for key in _KEYS)
+    laser, sensor, counts = contents.places("C_i"), contents.places("C_d"), contents.counts("sub_Sig")
     if counts.ndim != 2 or laser.shape != (len(counts), 3) or sensor.shape != laser.shape:
         raise CaptureError(
             f"{path.name} must hold C_i [S, 3], C_d [S, 3] and sub_Sig [S, T]; found {laser.shape}, {sensor.shape}, {counts.shape}"
         )
-    if counts.size == 0:
-        raise CaptureError(f"sub_Sig in {path.name} is empty")
-    if not (np.isfinite(laser).all() and np.isfinite(sensor).all()):
-        raise CaptureError(f"C_i or C_d in {path.name} holds NaN or infinite coordinates")
     width = options.bin_width_ps or BIN_WIDTH_PS
-    laser, sensor, scale = _world(laser.astype(np.float64), sensor.astype(np.float64), options)
+    laser, sensor, scale = _world(laser, sensor, options)
     fixed_laser, fixed_sensor = (bool((points == points[0]).all()) for points in (laser, sensor))
     one_scan = fixed_laser or fixed_sensor or np.array_equal(laser, sensor)
     grid = grid_of(sensor if fixed_laser else laser) if one_scan else None
@@ -89,7 +85,7 @@ def _kept_bins(counts: np.ndarray) -> tuple[tuple[int, int] | None, list[str]]:
     if len(filled) == 0:
         return None, []
     gate = (int(filled[0]), int(filled[-1]) + 1)
-    told = [f"gate [{gate[0]}, {gate[1]}): the bins that hold any counts"]
+    told = [f"bins {gate[0]} to {gate[1] - 1} hold counts and are the gate unless another is given"]
     seen = counts.any(axis=1)
     if not seen.all():
         told.append(f"{int((~seen).sum())} of {len(seen)} spots hold no counts at all")

@@ -15,13 +15,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import psutil
-import scipy.io
 
+from data_modules.readers.mat5 import list_mat5, read_mat5
 from nlos_lit.errors import CaptureError
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
-_MATLAB_NUMBERS = {"double", "single", "logical"} | {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 
 
 @dataclass(frozen=True)
@@ -89,11 +88,27 @@ class Contents:
             raise CaptureError(f"{name} in {self.path.name} does not hold real numbers")
         self._check_size(name, entry)
         with _damage(self.path):
-            values = self._read_hdf5(name) if self.container == "hdf5" else self._read_mat5(name)
+            values = self._read_hdf5(name) if self.container == "hdf5" else read_mat5(self.path, name)
         values = np.asarray(values)
         if values.dtype.kind not in "uifb":
             raise CaptureError(f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})")
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
+
+    def counts(self, name: str) -> np.ndarray:
+        """One array of transients: not empty and finite."""
+        values = self.read(name)
+        if values.size == 0:
+            raise CaptureError(f"{name} in {self.path.name} is empty ({'×'.join(map(str, values.shape))})")
+        if not (np.isfinite(values.min()) and np.isfinite(values.max())):
+            raise CaptureError(f"{name} in {self.path.name} holds NaN or infinite values; clean the file or mask those spots")
+        return values
+
+    def places(self, name: str) -> np.ndarray:
+        """Coordinates or directions as float64: finite and below a thousand kilometres."""
+        values = self.read(name).astype(np.float64)
+        if values.size == 0 or not np.abs(values).max() < 1e6:
+            raise CaptureError(f"{name} in {self.path.name} must hold finite coordinates in metres")
+        return values
 
     def scalar(self, name: str) -> float:
         """A finite number stored as an array of one element."""
@@ -130,14 +145,9 @@ class Contents:
             values = file[name.replace(".", "/")][()]
         return values.T if self.matlab and isinstance(values, np.ndarray) else values
 
-    def _read_mat5(self, name: str) -> np.ndarray:
-        variable, _, member = name.partition(".")
-        values = scipy.io.loadmat(self.path, variable_names=[variable])[variable]
-        return values[member].reshape(-1)[0] if member else values
-
 
 def open_contents(path: str | Path) -> Contents:
-    """List a file or folder without reading its arrays (for structs of old MATLAB files: without reading other variables).
+    """List a file or folder without reading its arrays (but for the structs of old MATLAB files, which have no table).
 
     Raises:
         CaptureError: nothing there, not readable, damaged, or of no known container.
@@ -187,32 +197,31 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
     entries: dict[str, Entry] = {}
     matlab = head.startswith(b"MATLAB 7.3")
     with _damage(path), h5py.File(path, "r") as file:
-        for name, item in file.items():
+        for name, item in _hard_links(file):
             members = {name: item}
             if isinstance(item, h5py.Group):
-                members = {f"{name}.{member}": value for member, value in item.items()}
+                members = {f"{name}.{member}": value for member, value in _hard_links(item)}
             for label, dataset in members.items():
-                if isinstance(dataset, h5py.Dataset):
+                if isinstance(dataset, h5py.Dataset) and not dataset.is_virtual and not dataset.external:
                     matlab = matlab or "MATLAB_class" in dataset.attrs
-                    shape = dataset.shape or ()
                     numeric = dataset.shape is not None and dataset.dtype.kind in "uifb"
+                    shape = dataset.shape or ()
                     entries[label] = Entry(shape, numeric, math.prod(shape) * dataset.dtype.itemsize)
     if matlab:
         entries = {name: Entry(entry.shape[::-1], entry.numeric, entry.size) for name, entry in entries.items()}
     return Contents(path, "hdf5", entries, matlab)
 
 
+def _hard_links(group: h5py.Group) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
+    """What lies in the file itself; links to other places and files are not followed."""
+    return [(name, group[name]) for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
+
+
 def _list_mat5(path: Path) -> Contents:
-    entries: dict[str, Entry] = {}
     with _damage(path):
-        for name, shape, kind in scipy.io.whosmat(path):
-            # MATLAB stores doubles that are small integers in fewer bytes, so the stored size may be an eighth
-            entries[name] = Entry(tuple(shape), kind in _MATLAB_NUMBERS, math.prod(shape))
-            if kind == "struct" and math.prod(shape) == 1 and path.stat().st_size < psutil.virtual_memory().available:
-                record = scipy.io.loadmat(path, variable_names=[name])[name]
-                for member in record.dtype.names or ():
-                    value = np.asarray(record[member].reshape(-1)[0])
-                    entries[f"{name}.{member}"] = Entry(value.shape, value.dtype.kind in "uifb", value.nbytes)
+        listed = list_mat5(path)
+    # whole doubles may be stored in single bytes, so the least size counts
+    entries = {name: Entry(shape, numeric, math.prod(shape)) for name, (shape, numeric) in listed.items()}
     return Contents(path, "mat5", entries)
 
 

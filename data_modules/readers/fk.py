@@ -11,7 +11,6 @@ from data_modules.readers.assemble import (
     assemble,
     bin_length_of,
     cell_centres,
-    gate_after_direct_pulse,
     remove_delays,
     wall_points,
 )
@@ -40,7 +39,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         raise CaptureError(f"meas in {path.name} must be [rows, columns, bins]; found {contents.entries['meas'].shape}")
     width = options.bin_width_ps or BIN_WIDTH_PS
     sides = options.wall_sides or (WALL_SIZE, WALL_SIZE)
-    data = contents.read("meas")
+    data = contents.counts("meas")
     rows, columns, bins = data.shape
     counts = data.reshape(rows * columns, bins)
     steps = [f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m"]
@@ -53,7 +52,6 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         t_start = offset * bin_length_of(width)
         steps.append(f"tofgrid: {told}")
     points = wall_points(-cell_centres(rows, sides[1]), -cell_centres(columns, sides[0]), "yx")
-    gate, told = gate_after_direct_pulse(counts, bin_length_of(width), t_start) if counts.size else (None, "")
     return assemble(
         path,
         NAME,
@@ -64,8 +62,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         bin_length=bin_length_of(width),
         t_start=t_start,
         shape=(rows, columns),
-        gate=gate,
-        steps=[*steps, told],
+        behind_pulse=True,
+        steps=[*steps],
     )
 
 

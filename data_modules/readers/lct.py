@@ -9,7 +9,6 @@ from data_modules.readers.assemble import (
     assemble,
     bin_length_of,
     cell_centres,
-    gate_after_direct_pulse,
     wall_points,
 )
 from data_modules.readers.contents import Contents, open_contents
@@ -40,12 +39,11 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         if half <= 0:
             raise CaptureError(f"width in {path.name} must be half the wall's side in metres; found {half}")
         sides = (2 * half, 2 * half)
-    data = contents.read("rect_data")
+    data = contents.counts("rect_data")
     nx, ny, bins = data.shape
     counts = data.reshape(nx * ny, bins)
     width = options.bin_width_ps or BIN_WIDTH_PS
     points = wall_points(cell_centres(nx, sides[0]), -cell_centres(ny, sides[1]), "xy")
-    gate, told = gate_after_direct_pulse(counts, bin_length_of(width), options.t_start or 0.0) if counts.size else (None, "")
     return assemble(
         path,
         NAME,
@@ -55,6 +53,6 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         sensor=points,
         bin_length=bin_length_of(width),
         shape=(nx, ny),
-        gate=gate,
-        steps=[f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m", told],
+        behind_pulse=True,
+        steps=[f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m"],
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from data_modules.readers.assemble import COMMON_OPTIONS, assemble, bin_length_of, gate_after_direct_pulse, wall_points
+from data_modules.readers.assemble import COMMON_OPTIONS, assemble, bin_length_of, wall_points
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
@@ -38,13 +38,12 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     width = options.bin_width_ps or 1e12 * contents.scalar("ts")
     if not 0.1 < width < 1e4:
         raise CaptureError(f"ts in {path.name} makes bins of {width:g} ps; expected seconds, about 4e-12 (or give bin_width_ps)")
-    data = contents.read("rect_data")
+    data = contents.counts("rect_data")
     rows, columns, bins = data.shape
     row, column = _detector(contents, rows, columns)
     across, down = _spacing(contents, options, rows, columns)
     points = wall_points(down * ((rows - 1) / 2 - np.arange(rows)), across * (np.arange(columns) - (columns - 1) / 2), "yx")
     counts = data.reshape(rows * columns, bins)
-    gate, told = gate_after_direct_pulse(counts, bin_length_of(width), options.t_start or 0.0) if counts.size else (None, "")
     return assemble(
         path,
         NAME,
@@ -54,8 +53,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         sensor=np.broadcast_to(points[row * columns + column], points.shape),
         bin_length=bin_length_of(width),
         shape=(rows, columns),
-        gate=gate,
-        steps=[f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column {column + 1}", told],
+        behind_pulse=True,
+        steps=[f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column {column + 1}"],
     )
 
 

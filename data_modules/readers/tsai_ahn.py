@@ -49,7 +49,7 @@ def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capt
     distance = contents.scalar("NLOSDATA.target_dist") if "NLOSDATA.target_dist" in contents else float(laser[:, 2].mean())
     length = bin_length_of(options.bin_width_ps) if options.bin_width_ps else contents.scalar("NLOSDATA.delta")
     confocal = bool(contents.scalar("NLOSDATA.is_confocal")) if "NLOSDATA.is_confocal" in contents else False
-    data = contents.read("NLOSDATA.transient")
+    data = contents.counts("NLOSDATA.transient")
     spots, shape = (len(laser), None) if confocal else (len(laser) * len(sensor), None)
     counts = data.reshape(-1, data.shape[-1]) if data.ndim in (2, 3) else data
     if counts.ndim != 2 or len(counts) != spots:
@@ -91,7 +91,7 @@ def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Captur
     if options.wall_size is not None:
         raise CaptureError(f"wall_size has no meaning for {path.name}: its lighting array gives each wall point")
     points = _points(contents, "lighting")
-    counts = contents.read("transient")
+    counts = contents.counts("transient")
     if counts.ndim != 2 or len(counts) != len(points):
         raise CaptureError(f"transient in {path.name} is {counts.shape}; expected [{len(points)}, T], one row a lighting point")
     order, shape = grid_of(points) or (np.arange(len(points)), None)
@@ -115,7 +115,7 @@ def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Captur
     if contents.ndim("meas") != 3:
         raise CaptureError(f"meas in {path.name} must be [x, y, bins]; found {contents.entries['meas'].shape}")
     _ask(path, options, "bin_width_ps", "wall_size")
-    data = contents.read("meas")
+    data = contents.counts("meas")
     nx, ny, bins = data.shape
     sides = options.wall_sides
     points = wall_points(-cell_centres(nx, sides[0]), cell_centres(ny, sides[1]), "xy")
@@ -133,9 +133,9 @@ def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Captur
 
 
 def _points(contents: Contents, name: str) -> np.ndarray:
-    points = contents.read(name).astype(np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or not np.isfinite(points).all():
-        raise CaptureError(f"{name} in {contents.path.name} must be finite points [N, 3]; found shape {points.shape}")
+    points = contents.places(name)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise CaptureError(f"{name} in {contents.path.name} must be points [N, 3]; found shape {points.shape}")
     return points
 
 

@@ -39,10 +39,10 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents.require("H", "delta_t", "sensor_grid_xyz", "laser_grid_xyz")
     laser, sensor, shape, counts = _spots(contents)
     normals = [_normals(contents, name, points) for name, points in (("laser", laser), ("sensor", sensor))]
-    laser, sensor, *normals = _pair(contents, shape, laser, sensor, *normals)
+    laser, sensor, *normals = _pair(shape, laser, sensor, *normals)
     length = contents.scalar("delta_t")
-    if length <= 0:
-        raise CaptureError(f"delta_t in {path.name} must be a positive path length; found {length}")
+    if not 1e-6 < length < 10:
+        raise CaptureError(f"delta_t in {path.name} must be a path length in metres; found {length}")
     t_start = contents.scalar("t_start") if contents.ndim("t_start") >= 0 else 0.0
     text = contents.text("scene_info")
     ours = own_facts(text, path)
@@ -105,13 +105,13 @@ def _own(
 def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] | None, np.ndarray]:
     """Laser points ``[.., 3]``, sensor points ``[.., 3]``, the shape of H's spots and ``[S, T]`` values."""
     name = contents.path.name
-    values = contents.read("H")
+    values = contents.counts("H")
     kind = {3: T_SX_SY, 5: T_LX_LY_SX_SY, 2: T_SI}.get(values.ndim, 0)
     if contents.ndim("H_format") >= 0:
         kind = int(contents.scalar("H_format"))
     if _AXES.get(kind) != values.ndim:
         raise CaptureError(f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: T_Li_Si)")
-    laser, sensor = (contents.read(key) for key in ("laser_grid_xyz", "sensor_grid_xyz"))
+    laser, sensor = (contents.places(key) for key in ("laser_grid_xyz", "sensor_grid_xyz"))
     for key, points in (("laser_grid_xyz", laser), ("sensor_grid_xyz", sensor)):
         if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.size == 0:
             raise CaptureError(f"{key} in {name} must be [X, Y, 3] or [N, 3]; found {points.shape}")
@@ -132,20 +132,16 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     return laser, sensor, shape, np.ascontiguousarray(values.reshape(len(values), -1).T)
 
 
-def _pair(
-    contents: Contents, shape: tuple[int, ...] | None, laser: np.ndarray, sensor: np.ndarray, *normals: np.ndarray
-) -> list[np.ndarray]:
+def _pair(shape: tuple[int, ...] | None, laser: np.ndarray, sensor: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
     """Laser and sensor points and normals, ``[S, 3]`` each, one row a spot."""
     lasers, sensors = laser.size // 3, sensor.size // 3
     product = shape is None or len(shape) == 4
     spread = []
     for points, is_laser in ((laser, True), (sensor, False), (normals[0], True), (normals[1], False)):
-        rows = points.reshape(-1, 3).astype(np.float64)
+        rows = points.reshape(-1, 3)
         if product:
             rows = np.repeat(rows, sensors, axis=0) if is_laser else np.tile(rows, (lasers, 1))
         spread.append(rows if product or len(rows) == max(lasers, sensors) else np.repeat(rows, max(lasers, sensors), axis=0))
-        if not np.isfinite(spread[-1]).all():
-            raise CaptureError(f"the wall points or normals in {contents.path.name} hold NaN or infinite coordinates")
     return spread
 
 
@@ -154,7 +150,7 @@ def _normals(contents: Contents, name: str, points: np.ndarray) -> np.ndarray:
     key = f"{name}_grid_normals"
     if contents.ndim(key) < 1:
         return np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    normals = contents.read(key)
+    normals = contents.places(key)
     if normals.shape != points.shape:
         raise CaptureError(f"{key} in {contents.path.name} is {normals.shape} where the points are {points.shape}")
     return normals
@@ -163,8 +159,8 @@ def _normals(contents: Contents, name: str, points: np.ndarray) -> np.ndarray:
 def _device(contents: Contents, name: str) -> np.ndarray | None:
     if contents.ndim(name) < 1:
         return None
-    place = contents.read(name).ravel().astype(np.float64)
-    return place if place.shape == (3,) and np.isfinite(place).all() else None
+    place = contents.places(name).ravel()
+    return place if place.shape == (3,) else None
 
 
 def _tal_rendered(text: str) -> bool:

@@ -35,18 +35,19 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents.require("data", "deltaT", "cameraGridPositions", "cameraPosition")
     if contents.ndim("data") not in (4, 5, 6, 7):
         raise CaptureError(f"data in {path.name} must have 4 to 7 axes; found {contents.entries['data'].shape}")
-    camera, last = _grid(contents, "cameraGridPositions")
-    normals = _grid(contents, "cameraGridNormals")[0] if "cameraGridNormals" in contents else None
     confocal = contents.ndim("data") < 6
+    last = _coordinates_last(contents, confocal)
+    camera = _grid(contents, "cameraGridPositions", last)
+    normals = _grid(contents, "cameraGridNormals", last) if "cameraGridNormals" in contents else None
     laser, laser_normals = camera, normals
     if not confocal:
-        laser, _ = _grid(contents, "laserGridPositions")
-        laser_normals = _grid(contents, "laserGridNormals")[0] if "laserGridNormals" in contents else None
+        laser = _grid(contents, "laserGridPositions", last)
+        laser_normals = _grid(contents, "laserGridNormals", last) if "laserGridNormals" in contents else None
     counts, colours, bounces = _transients(contents, camera.shape[:2], None if confocal else laser.shape[:2], last)
     toward = np.array([0.0, -1.0, 0.0])
     rotation = wall_rotation(toward if normals is None else normals)
-    camera_at = contents.read("cameraPosition").ravel().astype(np.float64)
-    laser_at = contents.read("laserPosition").ravel().astype(np.float64) if "laserPosition" in contents else camera_at
+    camera_at = contents.places("cameraPosition").ravel()
+    laser_at = contents.places("laserPosition").ravel() if "laserPosition" in contents else camera_at
     if camera_at.shape != (3,) or laser_at.shape != (3,):
         raise CaptureError(f"cameraPosition and laserPosition in {path.name} must be three coordinates")
     shape = camera.shape[:2] if confocal else (*laser.shape[:2], *camera.shape[:2])
@@ -56,7 +57,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         for grid, given, axes in ((laser, laser_normals, "laser"), (camera, normals, "camera"))
     ]
     length = contents.scalar("deltaT")
-    if not 0 < length < 1:
+    if not 1e-6 < length < 10:
         raise CaptureError(f"deltaT in {path.name} must be a path length in metres; found {length}")
     delays = (device_distances(laser_at, spread[0]) + device_distances(camera_at, spread[1])) / length
     counts, offset, told = remove_delays(counts, delays)
@@ -79,20 +80,37 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     )
 
 
-def _grid(contents: Contents, name: str) -> tuple[np.ndarray, bool]:
-    """``[a, b, 3]`` in the order of the data's axes, and whether the coordinates are the file's last axis."""
-    values = contents.read(name).astype(np.float64)
-    if values.ndim != 3 or 3 not in (values.shape[0], values.shape[-1]) or not np.isfinite(values).all():
-        raise CaptureError(f"{name} in {contents.path.name} must be finite points [3, y, x]; found shape {values.shape}")
-    last = values.shape[0] != 3
-    return (values if last else np.moveaxis(values, 0, -1)), last
+def _coordinates_last(contents: Contents, confocal: bool) -> bool:
+    """Whether the file's axes run spots first, coordinates and colour last (and not the other way round).
+
+    Raises:
+        CaptureError: data and positions fit together neither way.
+    """
+    data, points = contents.entries["data"].shape, contents.entries["cameraGridPositions"].shape
+    if len(points) == 3:
+        colour = len(data) % 2  # data may lack the axis of colours
+        for last, grid, scanned in (
+            (False, points[1:], data[2 + colour : 4 + colour]),
+            (True, points[:2], data[:2] if confocal else data[2:4]),
+        ):
+            if points[2 if last else 0] == 3 and scanned == grid:
+                return last
+    raise CaptureError(f"data {data} in {contents.path.name} does not scan the grid of cameraGridPositions {points}")
+
+
+def _grid(contents: Contents, name: str, last: bool) -> np.ndarray:
+    """``[a, b, 3]`` in the order of the data's axes."""
+    values = contents.places(name)
+    if values.ndim != 3 or values.shape[2 if last else 0] != 3:
+        raise CaptureError(f"{name} in {contents.path.name} must be a grid of points; found shape {values.shape}")
+    return values if last else np.moveaxis(values, 0, -1)
 
 
 def _transients(
     contents: Contents, camera: tuple[int, int], laser: tuple[int, int] | None, last: bool
 ) -> tuple[np.ndarray, int, int]:
     """``[S, T]`` with spots in the order (laser grid,) camera grid, and how many colours and bounces were summed."""
-    data = contents.read("data")
+    data = contents.counts("data")
     grids = [*camera, *(laser or ())]
     if not last:
         if data.ndim == len(grids) + 2:
@@ -100,18 +118,23 @@ def _transients(
         colours, bins, bounces = data.shape[:3]
         found = data.shape[3:]
         axes = [5, 6, 3, 4] if laser else [3, 4]
-        data = data.sum(axis=2, keepdims=True).sum(axis=0, keepdims=True).transpose([*axes, 1, 0, 2])
+        data = _sum(data, (0, 2)).transpose([*axes, 1, 0, 2])
     else:
         if data.ndim == len(grids) + 2:
             data = data[..., None]
         bounces, bins, colours = data.shape[-3:]
         found = (*data.shape[2:4], *data.shape[:2]) if laser else data.shape[:2]
-        data = data.sum(axis=-1).sum(axis=-2)
+        data = _sum(data, (-1, -3))
     if tuple(found) != tuple(grids):
         raise CaptureError(
             f"data in {contents.path.name} scans {tuple(found)} where the grid positions are {tuple(grids)}; they must agree"
         )
     return data.reshape(-1, bins), colours, bounces
+
+
+def _sum(data: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
+    with np.errstate(over="ignore"):  # infinite sums are refused with the counts
+        return data.sum(axis=axes, keepdims=True)
 
 
 def _spread(grid: np.ndarray, shape: tuple[int, ...], device: str) -> np.ndarray:
