@@ -32,6 +32,7 @@ class PipelineSettings:
         threshold: intensity below which a ray meets no surface.
         rays: n of the n × n rays of a spot.
         step_bins: spacing of ray samples in bins of path there and back (1: half a bin length).
+        beta, fine, relative_beta: of the softargmax, see :class:`~nlos_lit.geometry.ImplicitGeometry`.
         power, depth_exponent: of the intensity, see :class:`~nlos_lit.phasor.PhasorImaging`.
         wavelength: default wavelength λ in m; None takes four spot spacings.
         wavelength_start, sigma_start: factors on λ and on 4λ/6 that give the start of 2π/Ω_pf and σ_pf.
@@ -46,6 +47,8 @@ class PipelineSettings:
     rays: int = 200
     step_bins: float = 1.0
     beta: float = 1e3
+    fine: int = 4
+    relative_beta: bool = True
     power: float = 1.0
     depth_exponent: float = 2.0
     wavelength: float | None = None
@@ -90,7 +93,7 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
         tolerance=s.basis_tolerance,
     )
     bin_length, n_bins = capture.bin_length, capture.gate[1]
-    geometry = ImplicitGeometry(grid, rays=s.rays, threshold=s.threshold, step=s.step_bins * bin_length / 2, beta=s.beta)
+    geometry = ImplicitGeometry(grid, rays=s.rays, threshold=s.threshold, step=s.step_bins * bin_length / 2, beta=s.beta, fine=s.fine, relative=s.relative_beta)
     albedo = FreeAlbedo(grid.shape, s.albedo_start) if s.albedo == "free" else ResidualAlbedo(grid.shape, s.threshold)
     renderer = TransientRenderer(
         n_bins=n_bins,

@@ -31,11 +31,26 @@ class ImplicitGeometry(nn.Module):
         threshold: rays whose largest intensity is below meet no surface (paper: 0.05 synthetic, 0.2 real).
         step: spacing of samples along a ray, m (one per time bin: half a bin length).
         beta: sharpness of the softargmax.
+        fine: samples a step around the largest sample; 1 keeps the paper's one sample a bin, whose depth is
+            quantised to half a bin.
+        relative: β applies to intensities relative to the ray's largest, so that weak surfaces are located as sharply as
+            strong ones; False applies it to the intensities themselves, as the paper does.
     """
 
-    def __init__(self, grid: VolumeGrid, *, rays: int, threshold: float, step: float, beta: float = 1e3) -> None:
+    def __init__(
+        self,
+        grid: VolumeGrid,
+        *,
+        rays: int,
+        threshold: float,
+        step: float,
+        beta: float = 1e3,
+        fine: int = 1,
+        relative: bool = False,
+    ) -> None:
         super().__init__()
         self.side, self.threshold, self.step, self.beta = rays, threshold, step, beta
+        self.fine, self.relative = fine, relative
         self.shape = grid.shape
         self.register_buffer("rays", ray_grid(rays), persistent=False)
         self.register_buffer("origin", torch.tensor(grid.origin, dtype=torch.float32), persistent=False)
@@ -58,6 +73,7 @@ class ImplicitGeometry(nn.Module):
             threshold=self.threshold,
             step=self.step,
             reach=17.0 / self.beta,
+            fine=self.fine,
         )
         direction = torch.einsum("kij,kj->ki", frames[samples.spot], self.rays[samples.ray])
         distance = self._softargmax(intensity, samples, origins, direction)
@@ -71,7 +87,8 @@ class ImplicitGeometry(nn.Module):
         at = origins[samples.spot[samples.hit]] + samples.distance[:, None] * direction[samples.hit]
         value = trilinear(intensity, at, self.lattice)
         top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(0, samples.hit, value.detach(), "amax")
-        weight = torch.exp(self.beta * (value - top[samples.hit]))
+        sharpness = self.beta / top if self.relative else self.beta * torch.ones_like(top)
+        weight = torch.exp(sharpness[samples.hit] * (value - top[samples.hit]))
         zeros = torch.zeros(hits, device=value.device)
         total = zeros.index_add(0, samples.hit, weight)
         # Relative to the first sample, so that float32 keeps the sub-step digits.

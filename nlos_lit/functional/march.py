@@ -87,9 +87,13 @@ def march(
     threshold: float,
     step: float,
     reach: float,
+    fine: int = 1,
     chunk: int = 1 << 20,
 ) -> Samples:
-    """Find, on every ray that meets the threshold, the samples within ``reach`` of the ray's largest intensity.
+    """Find, on every ray that meets the threshold, the samples that decide where its surface lies.
+
+    With ``fine = 1`` these are all samples within ``reach`` of the ray's largest intensity. Otherwise the ray is sampled anew,
+    ``fine`` times denser, from one step before to one step behind its largest sample.
 
     Args:
         volume: ``[nz, nx, ny]`` intensity, scaled to a unit maximum.
@@ -98,25 +102,28 @@ def march(
         threshold: a ray whose largest sample is below it meets no surface.
         step: samples lie at ``(k + ½)·step`` from the wall point, m.
         reach: samples lower than the maximum by more than this carry no weight in the softargmax.
+        fine: samples a step around the maximum.
         chunk: samples evaluated at once, bounds the memory.
     """
     n = round(rays.shape[0] ** 0.5)
     device = volume.device
     pitch = lattice.pitch.tolist()
     # Bricks about as deep as wide, four lateral cells across: small enough to skip, large enough to be few.
-    deep = max(1, round(4 * pitch[0] / pitch[2]))
+    deep = max(1, round(4 * abs(pitch[0] / pitch[2])))
     size = (deep, 4, 4)
     bricks = occupied_bricks(volume, threshold, size)
-    extent = torch.tensor([size[1], size[2], size[0]], device=device) * lattice.pitch
-    last = lattice.origin + lattice.pitch * (torch.tensor([lattice.shape[1], lattice.shape[2], lattice.shape[0]], device=device) - 1)
+    edge = torch.tensor([size[1], size[2], size[0]], device=device)
+    last = torch.tensor([lattice.shape[1], lattice.shape[2], lattice.shape[0]], device=device) - 1
+    extent = edge * lattice.pitch
     cells = bricks[:, [1, 2, 0]]
+    # Opposite corners; neighbours share the very same number, so that a sample on a face belongs to one brick only.
+    start = lattice.origin + cells * edge * lattice.pitch
+    end = lattice.origin + torch.minimum((cells + 1) * edge, last) * lattice.pitch
     peak = torch.zeros(origins.shape[0] * n * n, device=device)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for spot, brick, ray in _candidates(cells, extent, lattice.origin, origins, frames, rays, n, chunk):
         direction = torch.einsum("sij,sj->si", frames[spot], rays[ray])
-        low = lattice.origin + cells[brick] * extent
-        high = torch.minimum(lattice.origin + (cells[brick] + 1) * extent, last)
-        near, far = _clip(origins[spot], direction, low, high)
+        near, far = _clip(origins[spot], direction, start[brick], end[brick])
         first = torch.ceil(near / step - 0.5).clamp_min(0)
         count = (torch.ceil(far / step - 0.5) - first).clamp_min(0).long()
         meets = torch.nonzero(count).squeeze(1)
@@ -134,9 +141,14 @@ def march(
         empty = torch.zeros(0, dtype=torch.long, device=device)
         return Samples(empty, empty, empty, torch.zeros(0, device=device))
     line, distance, value = (torch.cat(parts) for parts in zip(*kept, strict=True))
-    near_peak = value >= peak[line] - reach
+    near_peak = value >= peak[line] - (reach if fine == 1 else 0.0)
     line, distance = line[near_peak], distance[near_peak]
     hits, hit = torch.unique(line, return_inverse=True)
+    if fine > 1:
+        best = torch.zeros(len(hits), device=device).scatter_reduce(0, hit, distance, "amin", include_self=False)
+        offsets = torch.arange(-fine, fine + 1, device=device) * (step / fine)
+        distance = (best[:, None] + offsets).reshape(-1)
+        hit = torch.arange(len(hits), device=device).repeat_interleave(len(offsets))
     return Samples(hits // (n * n), hits % (n * n), hit, distance)
 
 
@@ -151,14 +163,16 @@ def _candidates(cells, extent, origin, origins, frames, rays, n, chunk):
     """Yield (spot, brick, ray) triples that contain every ray through every brick.
 
     A brick lies in a cone of half-angle α about its centre; the concentric map stretches by at most ``LIPSCHITZ``, so its rays
-    lie within ``LIPSCHITZ·α`` of the centre's coordinates in the square.
+    lie within ``LIPSCHITZ·α`` of the centre's coordinates in the square. A centre below the horizon is first moved to the
+    horizon's nearest point, which brings it closer to every ray.
     """
     centre = origin + (cells + 0.5) * extent
     radius = 0.5 * torch.linalg.vector_norm(extent)
     offset = centre[None] - origins[:, None]
     local = torch.einsum("sji,sbj->sbi", frames, offset)
     distance = torch.linalg.vector_norm(local, dim=2)
-    square = hemisphere_to_square(local / distance[..., None].clamp_min(1e-9))
+    level = torch.cat([local[..., :2], local[..., 2:].clamp_min(0)], dim=2)
+    square = hemisphere_to_square(torch.nn.functional.normalize(level, dim=2))
     half = torch.asin((radius / distance).clamp_max(1.0))
     span = LIPSCHITZ * half * n / 2 + 0.5
     span = torch.where(distance <= radius, torch.full_like(span, 2.0 * n), span)
