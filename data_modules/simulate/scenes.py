@@ -1,7 +1,7 @@
 """Hidden scenes without downloads: plates, spheres, strokes, and the embedded default scene.
 
-Everything faces the wall (normals towards -z) unless turned. Letters read rightly in a plot with x to the right and y up, which is
-the view of the wall from behind the scene.
+Everything faces the wall (normals towards -z) unless turned. Letters read rightly as seen from the wall,
+where +x is to the left and +y is up.
 """
 
 from __future__ import annotations
@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from data_modules.simulate.mesh import Mesh, join, load_mesh
+
+READABLE = np.array([-1.0, 1.0])  # from (right, up) as seen from the wall to world (x, y)
 
 
 def plate(
@@ -82,11 +84,11 @@ def strokes(
 def default_scene() -> Mesh:
     """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome (albedo 0.9).
 
-    Nothing about it is symmetric in x or y. The dome reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
+    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
-    letter = strokes(f, depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
-    dome = sphere((0.06, -0.20, 0.86), 0.18, rings=16, opening=np.pi / 2, albedo=0.9)
+    letter = strokes([line * READABLE for line in f], depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
+    dome = sphere((-0.06, -0.20, 0.86), 0.18, rings=16, opening=np.pi / 2, albedo=0.9)
     return join(letter, dome)
 
 
@@ -100,8 +102,8 @@ def letters() -> Mesh:
     s = np.concatenate([arc(-0.18, 0.10, 0.1, 0.1, 18, 252), arc(-0.18, -0.10, 0.1, 0.1, 90, -252)])
     u = np.concatenate([[[0.06, 0.22]], arc(0.18, -0.08, 0.12, 0.10, 180, 180), [[0.30, 0.22]]])
     return join(
-        strokes([s], depth=0.6, stroke=0.07, albedo=0.5),
-        strokes([u], depth=0.9, stroke=0.08, albedo=1.0),
+        strokes([s * READABLE], depth=0.6, stroke=0.07, albedo=0.5),
+        strokes([u * READABLE], depth=0.9, stroke=0.08, albedo=1.0),
     )
 
 

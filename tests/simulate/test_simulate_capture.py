@@ -115,8 +115,8 @@ def test_truth_is_what_lies_along_z_first():
     x, y = np.linspace(-0.45, 0.45, 19), np.linspace(-0.4, 0.4, 17)
     truth = view_from_wall(default_scene(), x, y)
     on_f, on_dome = (
-        (np.argmin(np.abs(x + 0.25)), np.argmin(np.abs(y - 0.2))),
-        (np.argmin(np.abs(x - 0.05)), np.argmin(np.abs(y + 0.2))),
+        (np.argmin(np.abs(x - 0.25)), np.argmin(np.abs(y - 0.2))),
+        (np.argmin(np.abs(x + 0.05)), np.argmin(np.abs(y + 0.2))),
     )
     assert truth.depth[on_f] == pytest.approx(0.5, abs=1e-6)
     assert truth.albedo[on_f] == pytest.approx(0.5)
