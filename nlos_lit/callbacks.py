@@ -31,7 +31,7 @@ class Scores(L.Callback):
         with torch.no_grad():
             volume = module.pipeline.phasor()
             regular = module.regularisation(volume, module.pipeline.albedo(volume))
-        return {**heldout, "loss": train["mse"] + float(sum(regular.values())), "train_mse": train["mse"]}
+        return {**heldout, "loss": train["mse"] + sum(float(term) for term in regular.values()), "train_mse": train["mse"]}
 
 
 class History(L.Callback):
@@ -52,7 +52,7 @@ class History(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: SelfCalibration, outputs: Any, *_: Any) -> None:
         for name, value in outputs.items():
-            self.values.setdefault(f"loss/{name}", []).append(float(value))
+            self.values.setdefault(f"loss/{name}", []).append(float(value.detach()))
         for name, entry in module.imaging_parameters().items():
             self.values.setdefault(f"parameters/{name}", []).append(entry["value"])
             module.log(f"parameters/{name}", entry["value"], batch_size=1)
