@@ -1,7 +1,7 @@
 """f-k migration: confocal transients as a wave field, carried back to the moment of its emission.
 
 Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, ACM Trans. Graph. 38, 116 (2019),
-after Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources that explode at ζ = 0 has unit speed, and the spectrum
+after Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources that explode at ζ = 0 has unit speed; the spectrum
 ``Φ(kx, ky, f)`` of what the wall receives, ``Ψ(x, y, 0, ζ)``, gives the field at ζ = 0:
 
     Ψ(x, y, z, 0) = ∭ kz/f · Φ(kx, ky, f) e^{i(kx x + ky y + kz z)} dkx dky dkz,      f = √(kx² + ky² + kz²).
@@ -18,6 +18,8 @@ from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import confocal_lattice, gated_transients, path_range
 from nlos_lit.capture import Capture
 from nlos_lit.grid import VolumeGrid
+
+_SCRATCH = 24 << 20  # bytes that the allocator and the libraries were seen to keep besides
 
 
 def fk(capture: Capture, grid: VolumeGrid, *, falloff: float = 4.0) -> torch.Tensor:
@@ -109,7 +111,7 @@ def fk_bytes(capture: Capture, grid: VolumeGrid) -> int:
     wide = 8 * half * px * py
     native = bins * capture.n_spots
     moving = max(2 * wide, 112 * block)
-    return wide + moving + 16 * size * capture.n_spots + 4 * (2 * native + grid.n_voxels + bins * grid.shape[0])
+    return _SCRATCH + wide + moving + 16 * size * capture.n_spots + 4 * (2 * native + grid.n_voxels + bins * grid.shape[0])
 
 
 def _cubic_weights(t: torch.Tensor) -> tuple[torch.Tensor, ...]:

@@ -99,3 +99,20 @@ def test_su_is_legible(method):
     for letter in ("S", "U"):
         dimmest, brightest = min(stroke(letter, *p) for p in on[letter]), max(stroke(letter, *p) for p in off[letter])
         assert dimmest > 1.25 * brightest
+
+
+def test_figure_4_is_legible():
+    """Not confocal, one detector: bars, crossbar and the open top of the 4, with +x to the left."""
+    readers = pytest.importorskip("data_modules.readers")
+    capture = readers.read_capture(real_file("measured/figure_4"))
+    assert capture.kind == "single_sensor"
+    grid = box((-0.6, 0.6, 31), (-0.6, 0.6, 31), (0.75, 1.1, 36))
+    front = reconstruct(capture, grid, "fbp").max(0).values.numpy()
+
+    def near(x: float, y: float) -> float:
+        i, j = np.abs(grid.x - x).argmin(), np.abs(grid.y - y).argmin()
+        return float(front[i - 1 : i + 2, j - 1 : j + 2].mean())
+
+    strokes = [near(x, y) for x, y in ((0.42, 0.18), (0.42, 0.05), (0.26, -0.02), (0.1, 0.2), (0.1, 0.0), (0.1, -0.2))]
+    gaps = [near(x, y) for x, y in ((0.26, 0.25), (0.34, -0.3), (-0.15, 0.1), (-0.15, -0.3))]
+    assert min(strokes) > 1.25 * max(gaps)
