@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import numpy as np
 
@@ -45,15 +47,17 @@ class ReaderOptions:
     def __post_init__(self) -> None:
         for name in ("bin_width_ps", "exposure_s"):
             _positive(name, getattr(self, name))
-        sides = self.wall_size if isinstance(self.wall_size, tuple | list) else (self.wall_size, self.wall_size)
+        sides = self.wall_size if isinstance(self.wall_size, Sequence) else (self.wall_size, self.wall_size)
         if len(sides) != 2:
             raise CaptureError(f"wall_size must be one length in metres or (x, y); found {self.wall_size!r}")
         for side in sides:
             _positive("wall_size", side)
-        if self.t_start is not None and not math.isfinite(self.t_start):
+        if self.t_start is not None and not (isinstance(self.t_start, Real) and math.isfinite(self.t_start)):
             raise CaptureError(f"t_start must be a path length in metres; found {self.t_start!r}")
-        if self.gate is not None and len(self.gate) != 2:
-            raise CaptureError(f"gate must be (first bin, last bin); found {self.gate!r}")
+        if self.gate is not None:
+            if not isinstance(self.gate, Sequence) or len(self.gate) != 2 or not all(isinstance(n, Integral) for n in self.gate):
+                raise CaptureError(f"gate must be (first bin, last bin); found {self.gate!r}")
+            object.__setattr__(self, "gate", (int(self.gate[0]), int(self.gate[1])))
 
     @property
     def given(self) -> dict[str, object]:
@@ -66,9 +70,9 @@ class ReaderOptions:
         """``wall_size`` as (x, y), m."""
         if self.wall_size is None:
             return None
-        return tuple(self.wall_size) if isinstance(self.wall_size, tuple | list) else (self.wall_size, self.wall_size)
+        return tuple(self.wall_size) if isinstance(self.wall_size, Sequence) else (self.wall_size, self.wall_size)
 
 
 def _positive(name: str, value: float | None) -> None:
-    if value is not None and not (math.isfinite(value) and value > 0):
+    if value is not None and not (isinstance(value, Real) and math.isfinite(value) and value > 0):
         raise CaptureError(f"{name} must be a positive number; found {value!r}")

@@ -123,7 +123,7 @@ def chen(folder: Path, run_length: bool = True) -> Path:
 
 
 def ahn(folder: Path, confocal: bool = True) -> Path:
-    """Wall at z = 0.6 of the file, object at its origin; laser points (±0.1, ±0.2, 0.6); bright at (0.1, -0.2) in bin 33 of 2 mm."""
+    """Wall at z = 0.6 of the file, object at its origin; laser points (±0.1, ±0.2, 0.6); bright at (0.1, -0.2), bin 33 of 2 mm."""
     points = np.array([[x, y, 0.6] for y in (0.2, -0.2) for x in (-0.1, 0.1)])
     sensors = points if confocal else np.array([[0.3, 0.1, 0.6]])
     data = {
@@ -156,7 +156,7 @@ def plain_cube(folder: Path) -> Path:
 
 
 def cid(folder: Path) -> Path:
-    """3 × 2 laser points 0.02 m apart, listed with falling height; detector at (2, 4); bright at (4, 6), bin 33; bins 20–49 kept."""
+    """3 × 2 laser points 0.02 m apart, heights falling; detector at (2, 4); bright at (4, 6), bin 33; bins 20–49 full."""
     points = np.array([[0, a, b] for a in (0, 2, 4) for b in (6, 4)])
     counts = np.zeros((6, 60), dtype=np.uint16)
     counts[:, 20:50] = 1
@@ -167,7 +167,7 @@ def cid(folder: Path) -> Path:
 
 
 def ytal(folder: Path, **changes: object) -> Path:
-    """3 × 2 confocal spots, x in (-0.2, 0, 0.2), y in (-0.1, 0.1), bins of 0.01 m from 0.5 m; bright at x = 0.2, y = -0.1, bin 33."""
+    """3 × 2 confocal spots, x in (-0.2, 0, 0.2), y in (-0.1, 0.1), 0.01 m bins from 0.5 m; bright at x = 0.2, y = -0.1, bin 33."""
     grid = np.stack(np.meshgrid([-0.2, 0.0, 0.2], [-0.1, 0.1], [0.0], indexing="ij"), axis=-1)[:, :, 0].astype(np.float32)
     items = {
         "H": cube((60, 3, 2), (33, 2, 0), np.float32),

@@ -17,7 +17,19 @@ TABLE = [
     ("lct", {}, None, "lct", "confocal", (4, 2), (0.3, 0.2), (0.3, 0.2), 300.5 * C * 4e-12, C * 4e-12, 9),
     ("fk", {}, None, "fk", "confocal", (4, 2), (0.75, -0.5), (0.75, -0.5), 35.5 * C * 32e-12, C * 32e-12, 9),
     ("fk", {"beside": True}, None, "fk", "confocal", (4, 2), (0.75, -0.5), (0.75, -0.5), 35.5 * C * 32e-12, C * 32e-12, 9),
-    ("phasor_field", {}, None, "phasor_field", "single_sensor", (4, 3), (-0.01, 0.02), (0.03, 0.0), 150.5 * C * 8e-12, C * 8e-12, 9),
+    (
+        "phasor_field",
+        {},
+        None,
+        "phasor_field",
+        "single_sensor",
+        (4, 3),
+        (-0.01, 0.02),
+        (0.03, 0.0),
+        150.5 * C * 8e-12,
+        C * 8e-12,
+        9,
+    ),
     ("zaragoza", {}, None, "zaragoza", "confocal", (3, 2), (0.0, 0.4), (0.0, 0.4), 0.505, 0.01, 9),
     ("zaragoza", {"reverse": True}, None, "zaragoza", "confocal", (3, 2), (0.0, 0.4), (0.0, 0.4), 0.505, 0.01, 9),
     ("zaragoza", {"exhaustive": True}, None, "zaragoza", "exhaustive", (2, 1, 3, 2), (0.4, 0.0), (0.0, 0.4), 0.505, 0.01, 9),
@@ -116,7 +128,7 @@ def test_the_gate_begins_behind_the_direct_pulse(tmp_path):
     scipy.io.savemat(tmp_path / "capture.mat", {"rect_data": data, "width": 0.35})
     first, last = read_capture(tmp_path / "capture.mat").gate
     assert last == 2048
-    # the tail, 3000·exp(-t/40), sinks below 1e-4 of its peak after 40·ln(10 000) = 368 bins; rounded counts end at 40·ln(6000) = 348
+    # 3000·exp(-t/40) sinks below 1e-4 of its peak after 40·ln(10 000) = 368 bins; whole counts end after 40·ln(6000) = 348
     assert 320 < first < 380
 
 

@@ -12,10 +12,9 @@ from data_modules.readers import ReaderOptions, read_capture, write_capture
 from nlos_lit.capture import Capture
 from nlos_lit.errors import CaptureError
 
-TAL_KEYS = {
-    "H", "H_format", "sensor_xyz", "sensor_grid_xyz", "sensor_grid_normals", "sensor_grid_format", "laser_xyz", "laser_grid_xyz",
-    "laser_grid_normals", "laser_grid_format", "volume_format", "delta_t", "t_start", "t_accounts_first_and_last_bounces", "scene_info",
-}  # fmt: skip
+TAL_KEYS = {"H", "H_format", "delta_t", "t_start", "t_accounts_first_and_last_bounces", "scene_info", "volume_format"} | {
+    f"{device}_{part}" for device in ("laser", "sensor") for part in ("xyz", "grid_xyz", "grid_normals", "grid_format")
+}
 
 
 def _grid(nx: int, ny: int, offset: float = 0.0) -> np.ndarray:
@@ -32,7 +31,7 @@ def _capture(kind: str) -> Capture:
         "single_laser": (np.tile([[0.3, -0.2, 0.0]], (6, 1)), a, (3, 2)),
         "single_sensor": (a, np.tile([[0.3, -0.2, 0.0]], (6, 1)), (3, 2)),
         "exhaustive": (*product, (3, 2, 2, 4)),
-        "paired_grids": (a, a + [0.01, 0.0, 0.0], (3, 2)),
+        "paired_grids": (a, a + np.array([0.01, 0.0, 0.0]), (3, 2)),
         "irregular_confocal": (rng.random((5, 3)), None, None),
         "irregular_single": (np.tile([[0.3, -0.2, 0.0]], (5, 1)), rng.random((5, 3)), None),
         "irregular_single_sensor": (rng.random((5, 3)), np.tile([[0.3, -0.2, 0.0]], (5, 1)), None),
@@ -177,7 +176,7 @@ def test_rounding_of_the_first_and_last_way_is_told_and_small(tmp_path):
     values = files.cube((120, 3, 2), (90, 2, 0), np.float32)
     path = files.ytal(tmp_path, H=values, t_accounts_first_and_last_bounces=np.bool_(True), t_start=0.0, delta_t=0.013)
     capture = read_capture(path)
-    spot, bin_ = np.argwhere(capture.counts == files.BRIGHT)[0]
+    bin_ = np.argwhere(capture.counts == files.BRIGHT)[0, 1]
     way = 2 * np.linalg.norm([0.2, -0.1, -0.3])
     assert capture.t_start + (bin_ + 0.5) * 0.013 == pytest.approx(90.5 * 0.013 - way, abs=0.013)
     assert "whole bins" in capture.provenance["steps"][0]
@@ -188,7 +187,13 @@ TAL = "args:\n  command: render\nconfig:\n  bin_width_opl: 0.01\ntal_version: 0.
 
 @pytest.mark.parametrize(
     ("text", "asked", "corrected"),
-    [(TAL, None, True), (TAL, False, False), ("name: spot\n", None, False), ("name: spot\n", True, True), ("# tal_version: 1\n", None, False)],
+    [
+        (TAL, None, True),
+        (TAL, False, False),
+        ("name: spot\n", None, False),
+        ("name: spot\n", True, True),
+        ("# tal_version: 1\n", None, False),
+    ],
 )
 def test_tals_raw_scale(tmp_path, text, asked, corrected):
     capture = read_capture(files.ytal(tmp_path, scene_info=text), options=ReaderOptions(raw_scale=asked))

@@ -1,0 +1,79 @@
+"""The command that shows a capture before a long run."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import reader_files as files
+import scipy.io
+
+import inspect_capture
+from data_modules.readers import READERS, read_capture
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("name", [name for name in files.WRITERS if name not in ("tsai", "cube")])
+def test_every_format_is_told_and_drawn(tmp_path, capsys, name):
+    path = files.WRITERS[name](tmp_path)
+    assert inspect_capture.main([str(path), "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr().out
+    fmt = read_capture(path).provenance["format"]
+    assert told.startswith(f"format       {fmt} (")
+    for word in ("kind", "spots", "wall", "bins", "time", "gate", "counts", "direct pulse", "first return", "done"):
+        assert f"\n{word}" in told
+    picture = tmp_path / "out" / f"{path.stem}_capture.png"
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+
+
+def _lct(folder: Path, scene_bin: int = 1200) -> Path:
+    bins = np.arange(2048)
+    mean = 3000 * np.exp(-bins / 40.0) + 60 * np.exp(-((bins - scene_bin) ** 2) / 200.0) + 0.2
+    rng = np.random.default_rng(1)
+    path = folder / "capture.mat"
+    scipy.io.savemat(path, {"rect_data": rng.poisson(np.broadcast_to(mean, (6, 6, 2048))).astype(np.uint16), "width": 0.35})
+    return path
+
+
+def test_depth_of_the_first_return_and_the_direct_pulse(tmp_path):
+    capture = read_capture(_lct(tmp_path))
+    findings = inspect_capture.examine(capture)
+    # the scene's pulse rises past a fifth of its peak 18 bins before bin 1200: half of 1182 · 1.199 mm
+    assert np.median(findings.first_returns) == pytest.approx(0.709, abs=0.012)
+    assert findings.pulse == 0
+    assert findings.pulse_share == pytest.approx(1 - 60 * 25.07 / (3000 * 40.5 + 60 * 25.07), abs=0.01)
+    assert findings.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "warning"),
+    [
+        (["--gate", "0", "2048"], "direct pulse"),
+        (["--gate", "60", "2048"], "before the direct pulse has decayed"),
+        (["--bin-width-ps", "100"], "scene 1[78] m away"),
+        (["--wall-size", "30"], "42.*across|3[0-9].*across"),
+        (["--gate", "1500", "1510"], "spots hold no counts"),
+    ],
+)
+def test_what_looks_wrong_is_said(tmp_path, capsys, arguments, warning):
+    assert inspect_capture.main([str(_lct(tmp_path)), "--out", str(tmp_path), *arguments]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("LOOK AT")]
+    assert any(__import__("re").search(warning, line) for line in lines), lines
+
+
+def test_an_error_is_one_sentence_and_status_2(tmp_path):
+    run = subprocess.run(
+        [sys.executable, "inspect_capture.py", str(tmp_path / "nothing.mat")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert run.returncode == 2
+    assert run.stdout == ""
+    assert run.stderr == f"there is no file {tmp_path / 'nothing.mat'}\n"
+
+
+def test_the_help_names_every_format(capsys):
+    with pytest.raises(SystemExit):
+        inspect_capture.main(["--help"])
+    told = capsys.readouterr().out
+    assert all(reader.NAME in told for reader in READERS)
