@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
 
 from nlos_lit.callbacks import Bar, Figures, History, Scores
-from nlos_lit.command import quiet_libraries, refuse_finished_folder, sentence_errors, write_config
+from nlos_lit.command import quiet_libraries, quote_numbers, refuse_finished_folder, sentence_errors, write_config
 from nlos_lit.results import shown_spots, write_results
 from nlos_lit.runs import find_checkpoint, prepare_run
 
@@ -72,5 +72,6 @@ def main(config: DictConfig) -> None:
 
 
 if __name__ == "__main__":
+    quote_numbers(sys.argv)
     refuse_finished_folder(sys.argv[1:])
     main()

@@ -18,7 +18,7 @@ from nlos_lit.parameters import BoundedParameter
 from nlos_lit.phasor import PhasorImaging
 from nlos_lit.pipeline import Pipeline
 from nlos_lit.renderer import TransientRenderer
-from nlos_lit.scan import scan_geometry
+from nlos_lit.scan import spot_spacing
 
 FWHM = 2 * math.sqrt(2 * math.log(2))  # full width at half maximum of a unit Gaussian
 SPEED_M_PER_PS = 299_792_458e-12
@@ -118,15 +118,6 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
         splat_sigma=s.splat_sigma if s.subtract_splat else None,
     )
     return Pipeline(capture, phasor, geometry, albedo, renderer, laser_sensor)
-
-
-def spot_spacing(capture: Capture) -> float:
-    """Distance between neighbouring scanned wall points, m."""
-    geometry = scan_geometry(capture)
-    if geometry is not None:
-        return float(np.abs(geometry.lattice.pitch).max())
-    points = capture.sensor if np.ptp(capture.sensor, axis=0).max() >= np.ptp(capture.laser, axis=0).max() else capture.laser
-    return float(np.sqrt(np.prod(np.sort(np.ptp(points, axis=0))[1:]) / capture.n_spots))
 
 
 def normalisation(capture: Capture, quantile: float = 0.999999) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import logging
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -40,6 +41,12 @@ def refuse_finished_folder(arguments: list[str]) -> None:
             file=sys.stderr,
         )
         sys.exit(2)
+
+
+def quote_numbers(arguments: list[str]) -> None:
+    """``scene=34`` → ``scene='34'`` in place: Hydra would take a scene whose name is a number for a number."""
+    for index, argument in enumerate(arguments):
+        arguments[index] = re.sub(r"^(scene)=(\d+)$", r"\1='\2'", argument)
 
 
 def write_config(config: Any, folder: Path) -> dict[str, Any]:

@@ -77,6 +77,15 @@ def scan_geometry(capture: Capture) -> ScanGeometry | None:
     return ScanGeometry(lattice, still, spots[None])
 
 
+def spot_spacing(capture: Capture) -> float:
+    """Distance between neighbouring scanned wall points, m."""
+    geometry = scan_geometry(capture)
+    if geometry is not None:
+        return float(np.abs(geometry.lattice.pitch).max())
+    points = capture.sensor if np.ptp(capture.sensor, axis=0).max() >= np.ptp(capture.laser, axis=0).max() else capture.laser
+    return float(np.sqrt(np.prod(np.sort(np.ptp(points, axis=0))[1:]) / capture.n_spots))
+
+
 def volume_grid(
     capture: Capture,
     *,
@@ -89,7 +98,7 @@ def volume_grid(
 
     Args:
         depth: nearest and farthest voxel plane, m from the wall.
-        depth_pitch: spacing of planes, m; None takes one time bin (half a bin length of path there and back … one way).
+        depth_pitch: spacing of planes, m; None takes half a bin length, which is one bin of path there and back.
         refine: voxels per lattice step.
         lateral: numbers of voxels along x and y, centred on the scan; None covers the scan.
 

@@ -110,7 +110,7 @@ def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Captur
 
 
 def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
-    """First axis along -x, second along +y, both as in the reconstructions published from these files."""
+    """Nothing says how the axes of such a cube run: taken as x, then y, both growing; flip_x, flip_y and swap_xy say otherwise."""
     contents.require("meas")
     if contents.ndim("meas") != 3:
         raise CaptureError(f"meas in {path.name} must be [x, y, bins]; found {contents.entries['meas'].shape}")
@@ -118,7 +118,7 @@ def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Captur
     data = contents.counts("meas")
     nx, ny, bins = data.shape
     sides = options.wall_sides
-    points = wall_points(-cell_centres(nx, sides[0]), cell_centres(ny, sides[1]), "xy")
+    points = wall_points(cell_centres(nx, sides[0]), cell_centres(ny, sides[1]), "xy")
     return assemble(
         path,
         NAME,

@@ -15,12 +15,19 @@ import torch
 from nlos_lit.baselines.backprojection import bp, bp_bytes, fbp, fbp_bytes
 from nlos_lit.baselines.light_cone import lct, lct_bytes
 from nlos_lit.baselines.migration import fk, fk_bytes
+from nlos_lit.baselines.rsd import rsd, rsd_bytes
 from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError, UserError
 from nlos_lit.grid import VolumeGrid
 
-METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "fk": fk}
-_BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {"bp": bp_bytes, "fbp": fbp_bytes, "lct": lct_bytes, "fk": fk_bytes}
+METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "fk": fk, "rsd": rsd}
+_BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {
+    "bp": bp_bytes,
+    "fbp": fbp_bytes,
+    "lct": lct_bytes,
+    "fk": fk_bytes,
+    "rsd": rsd_bytes,
+}
 
 
 def reconstruct(
