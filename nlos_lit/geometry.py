@@ -86,7 +86,9 @@ class ImplicitGeometry(nn.Module):
         hits = samples.spot.shape[0]
         at = origins[samples.spot[samples.hit]] + samples.distance[:, None] * direction[samples.hit]
         value = trilinear(intensity, at, self.lattice)
-        top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(0, samples.hit, value.detach(), "amax")
+        # With a relative β the largest intensity scales the exponent, so the gradient passes through it; otherwise it cancels.
+        largest = value if self.relative else value.detach()
+        top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(0, samples.hit, largest, "amax")
         sharpness = self.beta / top if self.relative else self.beta * torch.ones_like(top)
         weight = torch.exp(sharpness[samples.hit] * (value - top[samples.hit]))
         zeros = torch.zeros(hits, device=value.device)

@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-# Largest change of a square coordinate per radian on the sphere: |∂(a, b)/∂θ| ≤ 1.456, reached at the horizon's seams.
-LIPSCHITZ = 1.46
+# Largest change of a square coordinate per radian on the hemisphere: √(1/4 + 16/π²) = 1.368, reached at the horizon's seams.
+LIPSCHITZ = 1.37
 
 
 def square_to_hemisphere(square: Tensor) -> Tensor:
@@ -42,7 +42,7 @@ def ray_grid(n: int, device: torch.device | str = "cpu") -> Tensor:
 
 
 def wall_frame(normal: Tensor) -> Tensor:
-    """``[S, 3, 3]`` rotations from a wall point's local frame (z along its normal) to the world; identity where the normal is +z."""
+    """``[S, 3, 3]`` rotations from a wall point's local frame (z along its normal) to the world; identity for a normal +z."""
     up = torch.tensor([0.0, 1.0, 0.0], dtype=normal.dtype, device=normal.device).expand_as(normal)
     side = torch.tensor([1.0, 0.0, 0.0], dtype=normal.dtype, device=normal.device).expand_as(normal)
     helper = torch.where(normal[:, 1:2].abs() < 0.9, up, side)

@@ -149,6 +149,11 @@ def march(
         offsets = torch.arange(-fine, fine + 1, device=device) * (step / fine)
         distance = (best[:, None] + offsets).reshape(-1)
         hit = torch.arange(len(hits), device=device).repeat_interleave(len(offsets))
+        direction = torch.einsum("sij,sj->si", frames[hits // (n * n)], rays[hits % (n * n)])
+        position = (origins[hits // (n * n)][hit] + distance[:, None] * direction[hit] - lattice.origin) / lattice.pitch
+        # Outside the volume there is no intensity, so no surface either; the largest sample stays whatever the rounding.
+        inside = ((position >= 0) & (position <= last)).all(1) | (offsets == 0).repeat(len(hits))
+        distance, hit = distance[inside], hit[inside]
     return Samples(hits // (n * n), hits % (n * n), hit, distance)
 
 
