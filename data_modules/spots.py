@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Iterator
 
 import lightning as L
@@ -11,6 +13,8 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
+
+log = logging.getLogger(__name__)
 
 
 def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
@@ -27,7 +31,9 @@ def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
         patch = np.arange(capture.n_spots) // block**2
     else:
         nx, ny = capture.scan_shape[-2:]
-        patch = np.arange(nx)[:, None] // block + 2 * (np.arange(ny) // block)
+        # A stride coprime to `every` puts held-out patches into every row and every column of patches.
+        stride = next(k for k in range(2, every + 2) if math.gcd(k, every) == 1)
+        patch = np.arange(nx)[:, None] // block + stride * (np.arange(ny) // block)
         patch = np.broadcast_to(patch.reshape(-1), (capture.n_spots // (nx * ny), nx * ny)).reshape(-1)
     held = patch % every == every - 1
     if not held.any() or held.all():
@@ -106,8 +112,15 @@ class CaptureDataModule(L.LightningDataModule):
         self.capture, self.batch, self.seed = capture, batch, seed
         self.dataset = SpotDataset(capture)
         held = heldout_mask(capture, block, every)
-        self.train_spots = np.flatnonzero(~held)
-        self.heldout_spots = np.flatnonzero(held if every else ~held)
+        # A spot without a single gated count was not measured (figure 4 has a hole of 100): it says nothing about a model.
+        measured = self.dataset.counts.sum(1).numpy() > 0
+        if not measured.all():
+            log.warning("%d of %d spots hold no counts inside the gate; they are neither fitted nor scored", (~measured).sum(), len(held))
+        self.train_spots = np.flatnonzero(~held & measured)
+        self.heldout_spots = np.flatnonzero(held & measured if every else measured)
+        for name, spots in (("to train on", self.train_spots), ("to hold out", self.heldout_spots)):
+            if len(spots) == 0:
+                raise UserError(f"no measured spots are left {name}; check the gate and heldout.block, heldout.every")
         rng = np.random.default_rng(seed)
         self.monitored = np.sort(rng.permutation(self.heldout_spots)[:monitor_spots])
         self.reference = np.sort(rng.permutation(self.train_spots)[:monitor_spots])

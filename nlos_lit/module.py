@@ -69,7 +69,7 @@ class SelfCalibration(L.LightningModule):
             "kappa_s": sensor.kappa_s,
             "eta_s": sensor.background,
         }
-        return {name: {"value": float(p()), "unit": p.unit} for name, p in parameters.items()}
+        return {name: {"value": float(p().detach()), "unit": p.unit} for name, p in parameters.items()}
 
     def objective(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Loss terms of a batch: ``spots`` ``[S]`` and gated ``counts`` ``[S, T]``."""

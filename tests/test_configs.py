@@ -1,0 +1,75 @@
+"""Every config composes, and every key is read by something."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from nlos_lit.build import PipelineSettings
+
+ROOT = Path(__file__).resolve().parents[1]
+CONF = ROOT / "conf"
+
+
+def names(group: str) -> list[str]:
+    return sorted(path.stem for path in (CONF / group).glob("*.yaml") if not path.stem.startswith("_"))
+
+
+def composed(*overrides: str, command: str = "train") -> dict:
+    overrides = tuple(re.sub(r"=(\d+)$", r"='\1'", override) for override in overrides)
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose(command, overrides=list(overrides))
+    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+@pytest.mark.parametrize(
+    ("group", "name"), [(g, n) for g in ("scene", "model", "ablation", "trainer", "logger", "experiment") for n in names(g)]
+)
+def test_every_config_composes(group, name):
+    config = composed(f"{group}={name}")
+    assert config["scene"]["volume"]["depth"][0] < config["scene"]["volume"]["depth"][1]
+
+
+@pytest.mark.parametrize("scene", names("scene"))
+def test_scene_configs_have_the_same_keys_and_their_own_name(scene):
+    config = composed(f"scene={scene}")["scene"]
+    assert set(config) == set(composed()["scene"])
+    assert config["name"] == scene
+
+
+def test_the_papers_scenes_are_there_with_its_thresholds_and_iterations():
+    table = {"bunny": 100, "dragon": 100, "erato": 100, "indonesian": 150, "34": 300, "bike": 170, "resolution": 300, "su": 200}
+    table |= {"44i": 150, "nlos": 180}
+    for scene, iterations in table.items():
+        config = composed(f"scene={scene}")["scene"]
+        assert config["iterations"] == iterations
+        assert config["threshold"] == (0.05 if scene in ("bunny", "dragon", "erato", "indonesian") else 0.2)
+
+
+def leaves(config: dict, above: str = "") -> list[str]:
+    keys = []
+    for key, value in config.items():
+        keys += leaves(value, key) if isinstance(value, dict) else [key]
+    return keys
+
+
+def test_no_key_that_nothing_reads():
+    sources = "".join(
+        path.read_text() for folder in ("nlos_lit", "data_modules") for path in (ROOT / folder).rglob("*.py")
+    ) + "".join((ROOT / f"{name}.py").read_text() for name in ("train", "reconstruct"))
+    keys = {key for scene in names("scene") for key in leaves(composed(f"scene={scene}"))}
+    keys |= {key for method in names("method") for key in leaves(composed(f"method={method}", command="reconstruct"))}
+    unread = {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", sources)}
+    assert not unread
+
+
+def test_the_model_profiles_are_complete_settings():
+    for profile in names("model"):
+        model = composed(f"model={profile}")["model"]
+        settings = {k: v for k, v in model.items() if k in PipelineSettings.__dataclass_fields__}
+        assert set(settings) == set(PipelineSettings.__dataclass_fields__)
+        PipelineSettings(**settings)
