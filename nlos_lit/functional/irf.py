@@ -11,19 +11,19 @@ from torch import Tensor
 def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
     """Distribution function of ``κ e^{-κt} * N(0, σ)``: ``F(t) = Φ(t/σ) - e^{-κt + κ²σ²/2} Φ(t/σ - κσ)``.
 
-    Accurate for σ and 1/κ far below or far above the spacing of ``time`` (same unit as ``sigma`` and ``1/kappa``): the product
-    of a huge exponential and a tiny Φ is taken in the logarithm, and in the far left tail the two terms are
-    combined through erfcx so that they do not cancel.
+    Accurate for σ and 1/κ far below or far above the spacing of ``time`` (same unit as ``sigma`` and ``1/kappa``): Φ(x) of a
+    negative x is ½ e^{-x²/2} erfcx(-x/√2), so that the huge exponential of the second term meets the tiny Φ analytically, and in
+    the left tail both terms share the factor e^{-t²/(2σ²)}.
     """
     scaled = time / sigma
     late = scaled - kappa * sigma
     left = 0.5 * torch.exp(-0.5 * scaled**2)
     root = math.sqrt(0.5)
-    # For scaled < 0: Φ(s) = ½ e^{-s²/2} erfcx(-s/√2), and the second term is ½ e^{-s²/2} erfcx(-late/√2).
-    tail = left * (torch.special.erfcx(-scaled.clamp_max(0) * root) - torch.special.erfcx(-late.clamp_max(0) * root))
-    decay = -kappa * time + 0.5 * (kappa * sigma) ** 2
-    body = torch.special.ndtr(scaled) - torch.exp((decay + torch.special.log_ndtr(late)).clamp_max(0.0))
-    return torch.where(scaled < 0, tail, body).clamp(0.0, 1.0)
+    # Clamps keep the branch that is not taken finite, for the gradient's sake.
+    jitter = torch.where(scaled < 0, left * torch.special.erfcx(-scaled.clamp_max(0) * root), torch.special.ndtr(scaled))
+    decay = torch.exp((0.5 * (kappa * sigma) ** 2 - kappa * time).clamp_max(0)) * torch.special.ndtr(late)
+    delayed = torch.where(late < 0, left * torch.special.erfcx(-late.clamp_max(0) * root), decay)
+    return (jitter - delayed).clamp(0.0, 1.0)
 
 
 def response(sigma: Tensor, kappa: Tensor, n_bins: int, lead: int) -> Tensor:

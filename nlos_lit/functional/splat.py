@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ def gaussian_splat(
     """Scatter paths into ``[n_spots, n_bins]`` transients with the Gaussian of Sec. 4.3.
 
     The paper's Gaussian has a unit peak, so its sum over bins depends on the sub-bin phase (±0.1 % at σ = 0.62, ±5.7 % at 0.425:
-    a fake detector non-linearity). With ``normalise`` each path's weights are divided by their sum: energy is then conserved exactly.
+    a false detector non-linearity). With ``normalise`` each path's weights are divided by their sum, which conserves energy.
 
     Args:
         contribution: ``[K]`` energy of each path.
@@ -22,14 +24,12 @@ def gaussian_splat(
 
     Paths whose window leaves [0, n_bins) lose what lies outside, as light outside the recorded window is lost.
     """
-    half = max(3, int(torch.ceil(torch.tensor(4.5 * sigma))))
+    half = _half_width(sigma)
     offsets = torch.arange(-half, half + 1, device=time.device)
     centre = torch.floor(time.detach()).long()
     bins = centre[:, None] + offsets
     exponent = -0.5 * ((bins + 0.5 - time[:, None]) / sigma) ** 2
-    weights = torch.exp(exponent)
-    if normalise:
-        weights = weights / weights.sum(1, keepdim=True)
+    weights = torch.softmax(exponent, dim=1) if normalise else torch.exp(exponent)
     values = contribution[:, None] * weights
     inside = (bins >= 0) & (bins < n_bins)
     index = (spot[:, None] * n_bins + bins).clamp(0, n_spots * n_bins - 1)
@@ -41,8 +41,12 @@ def gaussian_splat(
 def splat_variance(sigma: float) -> float:
     """Variance in bins² that :func:`gaussian_splat` adds to an arrival time, averaged over sub-bin phases."""
     phase = torch.linspace(0, 1, 65, dtype=torch.float64)[:-1]
-    half = 12
+    half = _half_width(sigma)
     bins = torch.arange(-half, half + 1, dtype=torch.float64) + 0.5
-    weights = torch.exp(-0.5 * ((bins - phase[:, None]) / sigma) ** 2)
-    weights = weights / weights.sum(1, keepdim=True)
+    weights = torch.softmax(-0.5 * ((bins - phase[:, None]) / sigma) ** 2, dim=1)
     return float(((weights * (bins - phase[:, None]) ** 2).sum(1)).mean())
+
+
+def _half_width(sigma: float) -> int:
+    """Bins on either side of an arrival that receive energy."""
+    return max(3, math.ceil(4.5 * sigma))
