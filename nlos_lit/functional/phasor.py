@@ -31,6 +31,9 @@ def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
 def frequencies(omega_bounds: tuple[float, float], sigma_min: float, period: float, cutoff: float = 3.0) -> Tensor:
     """``[F]`` rad/m, float64: multiples of 2π/period that carry the spectrum of every admissible virtual pulse.
 
+    Frequencies at and below zero are left out, although a pulse of few cycles has weight there. Against Eq. 2, which has
+    them, the volume changes by 1e-5 at σΩ = 5, 2e-4 at 4.6, 2 % at 3.4 and 13 % at 2.6.
+
     Args:
         omega_bounds: smallest and largest Ω_pf, rad/m.
         sigma_min: smallest σ_pf, m.
@@ -48,10 +51,11 @@ def weight_basis(omega: Tensor, omega_bounds: tuple[float, float], sigma_bounds:
 
     The family is sampled densely against its own width (a fifth of 1/σ in Ω), so what lies between the samples is in the span too.
     """
-    sigmas = torch.exp(torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 12, dtype=torch.float64))
+    sigmas = torch.exp(torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 24, dtype=torch.float64))
     family = []
     for sigma in sigmas:
-        centres = torch.linspace(*omega_bounds, 3 + int((omega_bounds[1] - omega_bounds[0]) * float(sigma) * 5), dtype=torch.float64)
+        count = 3 + int((omega_bounds[1] - omega_bounds[0]) * float(sigma) * 5)
+        centres = torch.linspace(*omega_bounds, count, dtype=torch.float64)
         weights = virtual_illumination(omega[:, None], centres, sigma)
         family.append(weights / weights.norm(dim=0))
     samples = torch.cat(family, dim=1)
@@ -91,7 +95,7 @@ def lattice_phasors(
     Yields:
         ``[mx·my, 2, R]`` float32, real and imaginary part, plane after plane.
     """
-    n_scans, n_freq, nx, ny = field.shape
+    n_scans, _, nx, ny = field.shape
     mx, my = shape
     padded = [next_fast_length(nx + mx - 1), next_fast_length(ny + my - 1)]
     aperture = torch.fft.fft2(field, s=padded)
@@ -189,7 +193,7 @@ class PhasorMagnitude(torch.autograd.Function):
         result = torch.zeros(field.shape[2], dtype=parts.dtype, device=parts.device)
         for chunk in touched.split(1 << 19):
             pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
-            result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(2 * len(chunk), -1)
+            result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(-1, len(result))
         return None, result
 
 
