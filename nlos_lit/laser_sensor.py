@@ -17,7 +17,7 @@ class LaserSensor(nn.Module):
 
     Args:
         bin_length: m.
-        n_bins: bins of the transients; no kernel is longer.
+        n_bins: bins of the transients; the kernel reaches that far behind the arrival at most.
         sigma_ls: joint laser and jitter width, m of path. kappa_s: decay rate, 1/m of path.
         intensity: I_l, counts per unit of H_r. background: η_s, counts per bin.
         splat_sigma: width of the renderer's splat in bins. When given, its variance is taken out of Ψ, so that σ_ls is the
@@ -41,7 +41,7 @@ class LaserSensor(nn.Module):
         self.splat_variance = 0.0 if splat_sigma is None else splat_variance(splat_sigma)
         self.lead = min(n_bins - 1, math.ceil(5 * sigma_ls.upper / bin_length) + 1)
         tail = math.log(1e5) / (kappa_s.lower * bin_length) + 5 * sigma_ls.upper / bin_length
-        self.length = min(n_bins, self.lead + 2 + math.ceil(tail))
+        self.length = self.lead + min(n_bins, 2 + math.ceil(tail))
 
     def kernel(self) -> Tensor:
         """Ψ/I_l ``[length]``: share of a path's energy per bin, bin ``lead`` centred on its arrival."""
