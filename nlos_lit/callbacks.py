@@ -10,6 +10,9 @@ import numpy as np
 import torch
 
 from nlos_lit import figures
+from nlos_lit.capture import Capture
+from nlos_lit.export import Points
+from nlos_lit.functional.march import trilinear
 from nlos_lit.module import SelfCalibration
 from nlos_lit.progress import Ticker
 
@@ -114,7 +117,7 @@ class Figures(L.Callback):
 
 
 @torch.no_grad()
-def run_figures(module: SelfCalibration, capture: Any, spots: np.ndarray) -> dict[str, Any]:
+def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) -> dict[str, Any]:
     """Name → Figure of the present state of a run."""
     pipeline = module.pipeline
     index = torch.from_numpy(spots).to(module.device)
@@ -125,7 +128,8 @@ def run_figures(module: SelfCalibration, capture: Any, spots: np.ndarray) -> dic
     psi = sensor.kernel().cpu().numpy()
     start = capture.path_gate[0]
     path = start + (np.arange(rendering.expected.shape[1]) + 0.5) * capture.bin_length
-    labels = [f"spot at x = {capture.sensor[s, 0]:.2f}, y = {capture.sensor[s, 1]:.2f} m" for s in spots]
+    scanned, name = (capture.laser, "laser") if capture.kind == "single_sensor" else (capture.sensor, "spot")
+    labels = [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
     measured = capture.gated_counts()[spots]
     threshold = pipeline.geometry.threshold
     return {
@@ -134,21 +138,25 @@ def run_figures(module: SelfCalibration, capture: Any, spots: np.ndarray) -> dic
         "transients": figures.transients_plot(measured, rendering.expected.cpu().numpy(), path, labels),
         "kernel": figures.kernel_plot(float(pipeline.phasor.omega_pf()), float(pipeline.phasor.sigma_pf())),
         "laser_sensor": figures.laser_sensor_plot(psi, capture.bin_length, first=-sensor.lead * capture.bin_length),
-        "surface": figures.surface_plot(surface_points(module, spots)),
+        "surface": figures.surface_plot(surface_points(module, capture, spots)),
     }
 
 
 @torch.no_grad()
-def surface_points(module: SelfCalibration, spots: np.ndarray, block: int = 16):
-    """The surface seen from ``spots``, as :class:`~nlos_lit.export.Points`."""
-    from nlos_lit.export import Points
+def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray, block: int = 16) -> Points:
+    """The surface seen from the scanned wall points of ``spots``, in world coordinates.
 
+    Where one sensor point serves all spots, the laser points look in its stead: the volume can be seen from anywhere.
+    """
     pipeline = module.pipeline
     volume = pipeline.phasor()
     albedo = pipeline.albedo(volume)
+    end = "laser" if capture.kind == "single_sensor" else "sensor"
+    origins, normals = getattr(pipeline, end), getattr(pipeline, f"{end}_normal")
     parts: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(spots), block):
         index = torch.from_numpy(spots[first : first + block]).to(module.device)
-        surface, values = pipeline.render(volume, albedo, index)[1:]
+        surface = pipeline.surface(volume, origins[index], normals[index])
+        values = trilinear(albedo, surface.point, pipeline.geometry.lattice)
         parts.append(tuple(t.cpu().numpy().astype(np.float64) for t in (surface.point, surface.normal, values)))
     return Points(*(np.concatenate(column) for column in zip(*parts, strict=True)))

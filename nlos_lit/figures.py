@@ -225,7 +225,7 @@ def transients_plot(
         axes.plot(path, rendered[k], color=RED, label="rendered")
         if band is not None:
             axes.fill_between(path, band[0][k], band[1][k], color=ORANGE, alpha=0.4, linewidth=0, step="mid", label="noise")
-        axes.text(0.99, 0.95, labels[k], transform=axes.transAxes, ha="right", va="top")
+        axes.text(0.01, 0.95, labels[k], transform=axes.transAxes, ha="left", va="top")
         axes.set(ylabel="counts", xlim=(path[0], path[-1]))
         axes.set_ylim(bottom=0)
         if k < columns:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nlos_lit.albedo import FreeAlbedo, ResidualAlbedo
 from nlos_lit.capture import Capture
-from nlos_lit.functional.march import trilinear
+from nlos_lit.functional.march import expand, trilinear
 from nlos_lit.geometry import ImplicitGeometry, Surface
 from nlos_lit.laser_sensor import LaserSensor
 from nlos_lit.phasor import PhasorImaging
@@ -52,10 +52,23 @@ class Pipeline(nn.Module):
         rendered, surface, surface_albedo = self.render(intensity, albedo, spots)
         return Rendering(self.laser_sensor(rendered)[:, self.gate[0] :], intensity, albedo, surface, surface_albedo)
 
+    def surface(self, intensity: Tensor, sensor: Tensor, normal: Tensor) -> Surface:
+        """The surface seen from each of ``sensor`` ``[S, 3]``; points that occur several times are marched from once."""
+        places, which = torch.unique(torch.cat([sensor, normal], dim=1), dim=0, return_inverse=True)
+        if len(places) == len(sensor):
+            return self.geometry(intensity, sensor, normal)
+        seen = self.geometry(intensity, places[:, :3], places[:, 3:])
+        order = torch.argsort(seen.spot, stable=True)
+        counts = torch.bincount(seen.spot, minlength=len(places))
+        start = torch.cumsum(counts, 0) - counts
+        spot, rank = expand(counts[which])
+        row = order[start[which][spot] + rank]
+        return Surface(spot, *(field[row] for field in seen[1:]))
+
     def render(self, intensity: Tensor, albedo: Tensor, spots: Tensor) -> tuple[Tensor, Surface, Tensor]:
         """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given volume."""
         laser, sensor = self.laser[spots], self.sensor[spots]
-        surface = self.geometry(intensity, sensor, self.sensor_normal[spots])
+        surface = self.surface(intensity, sensor, self.sensor_normal[spots])
         surface_albedo = trilinear(albedo, surface.point, self.geometry.lattice)
         rendered = self.renderer(surface, surface_albedo, laser, self.laser_normal[spots], sensor, self.sensor_normal[spots])
         return rendered, surface, surface_albedo

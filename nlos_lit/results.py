@@ -35,7 +35,7 @@ def write_results(run: Run, history: History, folder: Path, total_seconds: float
         albedo = pipeline.albedo(volume)
     grid = pipeline.phasor.grid
     write_volume(folder / "volume.h5", volume.cpu().numpy(), grid, albedo=albedo.cpu().numpy())
-    points = surface_points(module, shown_spots(capture.n_spots, config["export"]["spots"]))
+    points = surface_points(module, capture, shown_spots(capture.n_spots, config["export"]["spots"]))
     write_points(folder / "points.ply", points)
     mesh = write_mesh(folder / "mesh.ply", points, depth=config["export"]["mesh_depth"])
     if mesh.reason:
