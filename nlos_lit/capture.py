@@ -145,9 +145,9 @@ class Capture:
         """
         if factor == 1:
             return self
-        bins = self.n_bins // factor
-        if factor < 1 or bins == 0:
+        if not 1 <= factor <= self.n_bins:
             raise CaptureError(f"cannot sum {factor} bins of {self.n_bins} into one")
+        bins = self.n_bins // factor
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
         summed = self.counts[:, : bins * factor].reshape(self.n_spots, bins, factor).sum(axis=2, dtype=wide)
         gate = (-(-self.gate[0] // factor), min(self.gate[1] // factor, bins))
@@ -159,9 +159,9 @@ class Capture:
             return self
         if self.scan_shape is None or len(self.scan_shape) != 2:
             raise CaptureError("only a capture with one scanned grid [nx, ny] can be down-sampled in space")
-        nx, ny = (n // factor for n in self.scan_shape)
-        if factor < 1 or nx * ny == 0:
+        if not 1 <= factor <= min(self.scan_shape):
             raise CaptureError(f"cannot sum {factor}×{factor} spots of a {self.scan_shape[0]}×{self.scan_shape[1]} scan into one")
+        nx, ny = (n // factor for n in self.scan_shape)
 
         def blocks(values: np.ndarray) -> np.ndarray:
             grid = values.reshape(*self.scan_shape, -1)[: nx * factor, : ny * factor]
