@@ -121,10 +121,18 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
 
 
 def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
-    """Counts that the loss counts as 1: the quantile of the gated bins."""
+    """Counts that the loss counts as 1: the quantile of the gated bins.
+
+    Raises:
+        UserError: the gate holds no photons to speak of.
+    """
     values = capture.gated_counts().reshape(-1)
     rank = min(values.size - 1, int(quantile * values.size))
-    return float(np.partition(values, rank)[rank])
+    scale = float(np.partition(values, rank)[rank])
+    if scale == 0:
+        first, last = capture.gate
+        raise UserError(f"the gate [{first}, {last}) holds no photons; the counts lie in other bins, so set the gate to theirs")
+    return scale
 
 
 def estimate_background(capture: Capture) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from nlos_lit.build import PipelineSettings, build_pipeline
 from nlos_lit.capture import Capture
 from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
 from nlos_lit.grid import VolumeGrid
@@ -234,6 +235,14 @@ def test_memory_budget():
         MemoryBudgetError, match=r"\(40, 4, 3\) voxels × \d+ needs .* GiB even in half precision, the budget is .* GiB"
     ):
         phasor.plan(capture, half.total_bytes - 1)
+
+
+def test_a_gate_without_photons_is_refused():
+    counts = np.arange(120).reshape(12, 10)
+    counts[:, 5:] = 0
+    capture = Capture(**fields(counts=counts, gate=(5, 10)))
+    with pytest.raises(UserError, match=r"gate \[5, 10\) holds no photons"):
+        build_pipeline(capture, volume_grid(capture, depth=(0.5, 0.7)), PipelineSettings(threshold=0.2, rays=8))
 
 
 SCATTERER = np.array([0.12, -0.06, 0.523])  # on a lateral voxel: elsewhere a slanted path trades lateral offset for depth
