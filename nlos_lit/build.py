@@ -93,7 +93,15 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
         tolerance=s.basis_tolerance,
     )
     bin_length, n_bins = capture.bin_length, capture.gate[1]
-    geometry = ImplicitGeometry(grid, rays=s.rays, threshold=s.threshold, step=s.step_bins * bin_length / 2, beta=s.beta, fine=s.fine, relative=s.relative_beta)
+    geometry = ImplicitGeometry(
+        grid,
+        rays=s.rays,
+        threshold=s.threshold,
+        step=s.step_bins * bin_length / 2,
+        beta=s.beta,
+        fine=s.fine,
+        relative=s.relative_beta,
+    )
     albedo = FreeAlbedo(grid.shape, s.albedo_start) if s.albedo == "free" else ResidualAlbedo(grid.shape, s.threshold)
     renderer = TransientRenderer(
         n_bins=n_bins,

@@ -79,7 +79,9 @@ class Capture:
         _check_counts(self.counts)
         first, last = (0, bins) if self.gate is None else (int(self.gate[0]), int(self.gate[1]))
         if not 0 <= first < last <= bins:
-            raise CaptureError(f"the gate [{first}, {last}) leaves no bins of the capture's {bins}; give 0 <= first < last <= {bins}")
+            raise CaptureError(
+                f"the gate [{first}, {last}) leaves no bins of the capture's {bins}; give 0 <= first < last <= {bins}"
+            )
         object.__setattr__(self, "gate", (first, last))
         if self.scan_shape is not None:
             shape = tuple(int(n) for n in self.scan_shape)
@@ -151,7 +153,8 @@ class Capture:
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
         summed = self.counts[:, : bins * factor].reshape(self.n_spots, bins, factor).sum(axis=2, dtype=wide)
         gate = (-(-self.gate[0] // factor), min(self.gate[1] // factor, bins))
-        return self._changed(f"summed {factor} bins into one", counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
+        step = f"summed {factor} bins into one"
+        return self._changed(step, counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
 
     def sum_spots(self, factor: int) -> Capture:
         """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one at their mean position."""

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,9 +14,10 @@ from nlos_lit.errors import MemoryBudgetError
 from nlos_lit.functional import phasor as F
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.parameters import BoundedParameter
-from nlos_lit.scan import ScanGeometry, scan_geometry, voxel_path_range
+from nlos_lit.scan import ScanGeometry, path_range, scan_geometry
 
-REACH = 4.0  # virtual pulse half-length in units of σ_pf, where its envelope is 3e-4
+ALIGNED = 1e-3  # how far a voxel may lie from its lattice point, in voxels
+REACH = 5.0  # virtual pulse half-length in units of σ_pf, where its envelope is 4e-6
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,16 @@ class PhasorPlan:
             f"phasor basis by {'FFT convolution' if self.method == 'lattice' else 'direct sum'}: {self.n_frequencies} frequencies "
             f"in {self.rank} dimensions, {self.field_bytes / 2**30:.2f} GiB {kind} + {self.working_bytes / 2**30:.2f} GiB working"
         )
+
+
+@dataclass(frozen=True)
+class LatticeLayout:
+    """Voxels on the scan's lattice: ``refine`` voxels a step, ``offset`` voxels from its first point."""
+
+    geometry: ScanGeometry
+    refine: int
+    offset: tuple[int, int]
+    padded_points: int  # of the zero-padded FFT
 
 
 class PhasorImaging(nn.Module):
@@ -86,18 +96,16 @@ class PhasorImaging(nn.Module):
         bounds = (self.omega_pf.lower, self.omega_pf.upper), (self.sigma_pf.lower, self.sigma_pf.upper)
         self.basis = F.weight_basis(self.omega, *bounds, self.tolerance)
         n_freq, rank = self.basis.shape
-        geometry = scan_geometry(capture)
-        if geometry is None:
+        layout = self._layout(capture)
+        if layout is None:
             working = capture.n_spots * n_freq * 8 + 256 * capture.n_spots * 64
         else:
-            points = math.prod(self._lattice_layout(geometry)[0])
-            scans = len(geometry.rows)
-            working = n_freq * points * 8 * (scans * 2 + 5)
+            working = n_freq * layout.padded_points * 8 * (len(layout.geometry.rows) * 2 + 5)
         working += 4 * capture.n_spots * capture.n_bins + 4 * self.grid.n_voxels * 8
         values = self.grid.n_voxels * 2 * rank
         for precision, size in ((torch.float32, 4), (torch.float16, 2)):
             if values * size + working <= memory_budget:
-                return PhasorPlan("direct" if geometry is None else "lattice", n_freq, rank, precision, values * size, working)
+                return PhasorPlan("direct" if layout is None else "lattice", n_freq, rank, precision, values * size, working)
         raise MemoryBudgetError(
             f"the phasor basis of {self.grid.shape} voxels × {rank} needs {(values * 2 + working) / 2**30:.1f} GiB even in half "
             f"precision, the budget is {memory_budget / 2**30:.1f} GiB; sum time bins or spots (scene.sum_bins, scene.sum_spots), "
@@ -126,19 +134,19 @@ class PhasorImaging(nn.Module):
         first, last = capture.gate
         time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length
         spectrum = F.spectrum(counts, time, self.omega)
-        geometry = scan_geometry(capture)
-        if geometry is None:
+        layout = self._layout(capture)
+        if layout is None:
             blocks = self._direct(capture, spectrum)
             total = -(-self.grid.n_voxels // 256)
         else:
-            blocks = self._lattice(geometry, spectrum)
+            blocks = self._lattice(layout, spectrum)
             total = self.grid.shape[0]
+        # Only ratios matter (the intensity has a unit maximum); this scale keeps half precision in range.
+        nearest = path_range(capture, self.grid)[0] / 2
+        scale = float(spectrum.abs().mean()) * capture.n_spots / nearest**2
         field = torch.empty(self.grid.n_voxels, 2, self.basis.shape[1], dtype=plan.precision, device=device)
-        row, scale = 0, None
+        row = 0
         for done, block in enumerate(blocks, start=1):
-            if scale is None:
-                # Only ratios matter (the intensity has a unit maximum); a sane scale keeps half precision in range.
-                scale = float(block.abs().max().clamp_min(1e-30))
             field[row : row + len(block)] = (block / scale).to(plan.precision)
             row += len(block)
             if progress is not None:
@@ -155,28 +163,36 @@ class PhasorImaging(nn.Module):
 
     def _frequencies(self, capture: Capture) -> Tensor:
         start, end = capture.path_gate
-        near, far = voxel_path_range(capture, self.grid)
+        near, far = path_range(capture, self.grid)
         period = max(end - near, far - start) + REACH * self.sigma_pf.upper
         return F.frequencies((self.omega_pf.lower, self.omega_pf.upper), self.sigma_pf.lower, period)
 
-    def _lattice_layout(self, geometry: ScanGeometry) -> tuple[tuple[int, int], int, tuple[int, int]]:
-        """Padded FFT shape, refinement and offset of the voxel lattice relative to the aperture's."""
-        lattice = geometry.lattice
-        refine = round(lattice.pitch[0] / self.grid.pitch[0])
-        offset = tuple(round((self.grid.origin[a] - lattice.first[a]) / self.grid.pitch[a]) for a in (0, 1))
+    def _layout(self, capture: Capture) -> LatticeLayout | None:
+        """How the voxels lie on the scan's lattice; None where they or the spots do not, and the direct sum is needed."""
+        geometry = scan_geometry(capture)
+        if geometry is None:
+            return None
+        lattice, grid = geometry.lattice, self.grid
+        refine = round(lattice.pitch[0] / grid.pitch[0])
+        steps = [(grid.origin[a] - lattice.origin[a]) / grid.pitch[a] for a in (0, 1)]
+        offset = (round(steps[0]), round(steps[1]))
+        apart = max(abs(step - whole) for step, whole in zip(steps, offset, strict=True))
+        stretch = max(abs(lattice.pitch[a] / grid.pitch[a] - refine) * grid.shape[1 + a] for a in (0, 1))
+        if refine < 1 or apart + stretch > ALIGNED:
+            return None
         sizes = [(n - 1) * refine + 1 for n in lattice.shape]
-        padded = tuple(F.next_fast_length(n + m - 1) for n, m in zip(sizes, self.grid.shape[1:], strict=True))
-        return padded, refine, offset
+        padded = [F.next_fast_length(n + m - 1) for n, m in zip(sizes, grid.shape[1:], strict=True)]
+        return LatticeLayout(geometry, refine, offset, padded[0] * padded[1])
 
-    def _lattice(self, geometry: ScanGeometry, spectrum: Tensor):
-        _, refine, offset = self._lattice_layout(geometry)
+    def _lattice(self, layout: LatticeLayout, spectrum: Tensor) -> Iterator[Tensor]:
+        geometry, refine = layout.geometry, layout.refine
         nx, ny = geometry.lattice.shape
         field = spectrum[:, torch.from_numpy(geometry.rows)].permute(1, 0, 2).reshape(len(geometry.rows), -1, nx, ny)
         if refine > 1:
             sparse = field.new_zeros(*field.shape[:2], (nx - 1) * refine + 1, (ny - 1) * refine + 1)
             sparse[:, :, ::refine, ::refine] = field
             field = sparse
-        plane = geometry.lattice.first[2]
+        plane = geometry.lattice.origin[2]
         fixed = geometry.fixed
         if fixed is not None:
             fixed = torch.from_numpy(fixed - np.array([0.0, 0.0, plane])).to(field.device)
@@ -185,14 +201,14 @@ class PhasorImaging(nn.Module):
             self.omega,
             self.basis,
             pitch=self.grid.pitch[:2],
-            offset=offset,
+            offset=layout.offset,
             shape=self.grid.shape[1:],
             depth=torch.from_numpy(self.grid.z - plane),
             fixed=fixed,
             voxel_origin=self.grid.origin[:2],
         )
 
-    def _direct(self, capture: Capture, spectrum: Tensor):
+    def _direct(self, capture: Capture, spectrum: Tensor) -> Iterator[Tensor]:
         z, x, y = np.meshgrid(self.grid.z, self.grid.x, self.grid.y, indexing="ij")
         voxels = torch.from_numpy(np.stack([x, y, z], axis=-1).reshape(-1, 3))
         return F.direct_phasors(

@@ -8,39 +8,65 @@ from dataclasses import dataclass
 import numpy as np
 
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
+from nlos_lit.errors import CaptureError, UserError
 from nlos_lit.grid import VolumeGrid
+
+_TOLERANCE = 0.01  # how far a spot may lie from its lattice point, in lattice pitches
 
 
 @dataclass(frozen=True)
-class ApertureLattice:
-    """A planar, axis-aligned, equally spaced grid of wall points parallel to the xy plane.
+class Lattice:
+    """Wall points on a regular planar grid: ``x_i = origin[0] + i·pitch[0]``, ``y_j = origin[1] + j·pitch[1]``, ascending.
 
-    ``first`` is point [0, 0] (m), ``pitch`` the signed steps along x and y (m), ``shape`` the numbers (nx, ny).
+    Args:
+        origin: ``(x, y, z)`` of lattice point ``(0, 0)``, m.
+        pitch: ``(dx, dy)``, m, positive.
+        shape: ``(nx, ny)``.
+        spots: ``[nx·ny]`` index of the capture's spot that lies on lattice point ``i·ny + j``.
     """
 
-    first: tuple[float, float, float]
+    origin: tuple[float, float, float]
     pitch: tuple[float, float]
     shape: tuple[int, int]
+    spots: np.ndarray
 
 
-def find_lattice(points: np.ndarray, shape: tuple[int, int], tolerance: float = 0.01) -> ApertureLattice | None:
-    """The lattice of ``points`` ``[nx·ny, 3]``, or None where they stray from one by more than ``tolerance`` pitches."""
-    nx, ny = shape
-    grid = points.reshape(nx, ny, 3)
-    if nx < 2 or ny < 2:
-        return None
-    dx = float((grid[-1, :, 0] - grid[0, :, 0]).mean() / (nx - 1))
-    dy = float((grid[:, -1, 1] - grid[:, 0, 1]).mean() / (ny - 1))
-    if dx == 0 or dy == 0:
-        return None
-    first = grid[0, 0]
-    ideal = np.stack(
-        np.broadcast_arrays(first[0] + dx * np.arange(nx)[:, None], first[1] + dy * np.arange(ny), first[2]), axis=-1
-    )
-    if np.abs(grid - ideal).max() > tolerance * min(abs(dx), abs(dy)):
-        return None
-    return ApertureLattice(tuple(float(v) for v in first), (dx, dy), shape)
+def find_lattice(points: np.ndarray) -> Lattice:
+    """The regular planar lattice that ``points [S, 3]`` fill, whatever their order.
+
+    Raises:
+        CaptureError: they do not; the message is the reason, as the end of a sentence that names the capture.
+    """
+    x, dx = _axis(points[:, 0], "x")
+    y, dy = _axis(points[:, 1], "y")
+    if len(x) * len(y) != len(points):
+        raise CaptureError(f"its {len(points)} spots do not fill a lattice of {len(x)} × {len(y)} positions")
+    depth = float(np.ptp(points[:, 2]))
+    if depth > _TOLERANCE * min(dx, dy):
+        raise CaptureError(f"its spots do not lie in a plane z = constant (they differ by {depth:.4g} m in z)")
+    cell = np.rint((points[:, 0] - x[0]) / dx).astype(int) * len(y) + np.rint((points[:, 1] - y[0]) / dy).astype(int)
+    spots = np.argsort(cell, kind="stable")
+    if not np.array_equal(cell[spots], np.arange(len(points))):
+        raise CaptureError("several of its spots share one lattice position")
+    return Lattice((float(x[0]), float(y[0]), float(points[:, 2].mean())), (dx, dy), (len(x), len(y)), spots)
+
+
+def _axis(values: np.ndarray, name: str) -> tuple[np.ndarray, float]:
+    """Ascending distinct coordinates along one axis and their spacing, which must be uniform."""
+    ordered = np.sort(values)
+    span = ordered[-1] - ordered[0]
+    steps = np.diff(ordered)
+    new = steps > max(steps.max(initial=0.0) / 2, 1e-9)
+    if not new.any():
+        raise CaptureError(f"its spots do not extend along {name}")
+    groups = np.split(ordered, np.flatnonzero(new) + 1)
+    centres = np.array([g.mean() for g in groups])
+    pitch = float(span / (len(groups) - 1))
+    off = max(np.abs(g - (ordered[0] + k * pitch)).max() for k, g in enumerate(groups))
+    if off > _TOLERANCE * pitch:
+        gaps = np.diff(centres)
+        raise CaptureError(f"its spots are not evenly spaced along {name} (gaps between {gaps.min():.4g} and {gaps.max():.4g} m)")
+    return centres, pitch
 
 
 @dataclass(frozen=True)
@@ -50,38 +76,40 @@ class ScanGeometry:
     Args:
         lattice: the scanned aperture.
         fixed: ``[L, 3]`` the wall point that stays put in each of the L scans; None when confocal.
-        rows: ``[L, nx·ny]`` capture rows (spots) of each scan.
+        rows: ``[L, nx·ny]`` capture rows (spots) of each scan, in the lattice's order.
     """
 
-    lattice: ApertureLattice
+    lattice: Lattice
     fixed: np.ndarray | None
     rows: np.ndarray
 
 
 def scan_geometry(capture: Capture) -> ScanGeometry | None:
     """The capture's lattice scans, or None where the direct sum is needed (curved wall, irregular spots)."""
-    if capture.scan_shape is None:
+    rows, moving, still = np.arange(capture.n_spots)[None], capture.sensor, None
+    if capture.kind == "exhaustive":
+        rows = rows.reshape(-1, math.prod(capture.scan_shape[2:]))
+        if any(np.abs(capture.sensor[r] - capture.sensor[rows[0]]).max() > 1e-6 for r in rows):
+            return None
+        still = capture.laser[rows[:, 0]]
+    elif capture.kind == "single_laser":
+        still = capture.laser[:1]
+    elif capture.kind == "single_sensor":
+        moving, still = capture.laser, capture.sensor[:1]
+    elif capture.kind != "confocal":
         return None
-    spots = np.arange(capture.n_spots)
-    if len(capture.scan_shape) == 4:
-        lx, ly, sx, sy = capture.scan_shape
-        rows = spots.reshape(lx * ly, sx * sy)
-        lattice = find_lattice(capture.sensor[rows[0]], (sx, sy))
-        same = all(np.allclose(capture.sensor[r], capture.sensor[rows[0]], atol=1e-6) for r in rows)
-        return ScanGeometry(lattice, capture.laser[rows[:, 0]], rows) if lattice and same else None
-    moving = capture.laser if capture.kind == "single_sensor" else capture.sensor
-    lattice = find_lattice(moving, capture.scan_shape)
-    if lattice is None or capture.kind not in ("confocal", "single_laser", "single_sensor"):
+    try:
+        lattice = find_lattice(moving[rows[0]])
+    except CaptureError:
         return None
-    still = {"confocal": None, "single_laser": capture.laser[:1], "single_sensor": capture.sensor[:1]}[capture.kind]
-    return ScanGeometry(lattice, still, spots[None])
+    return ScanGeometry(lattice, still, rows[:, lattice.spots])
 
 
 def spot_spacing(capture: Capture) -> float:
     """Distance between neighbouring scanned wall points, m."""
     geometry = scan_geometry(capture)
     if geometry is not None:
-        return float(np.abs(geometry.lattice.pitch).max())
+        return float(max(geometry.lattice.pitch))
     points = capture.sensor if np.ptp(capture.sensor, axis=0).max() >= np.ptp(capture.laser, axis=0).max() else capture.laser
     return float(np.sqrt(np.prod(np.sort(np.ptp(points, axis=0))[1:]) / capture.n_spots))
 
@@ -111,11 +139,11 @@ def volume_grid(
     pitch_z = capture.bin_length / 2 if depth_pitch is None else float(depth_pitch)
     if pitch_z <= 0 or refine < 1:
         raise UserError(f"the depth pitch ({pitch_z:g} m) and the refinement ({refine}) must be positive")
-    nz = max(2, int(math.floor((far - near) / pitch_z + 1e-6)) + 1)
+    nz = max(2, math.floor((far - near) / pitch_z + 1e-6) + 1)
     geometry = scan_geometry(capture)
     if geometry is not None:
         lattice = geometry.lattice
-        first, steps, counts = lattice.first, lattice.pitch, lattice.shape
+        first, steps, counts = lattice.origin, lattice.pitch, lattice.shape
     else:
         low, high = np.minimum(capture.sensor, capture.laser).min(0), np.maximum(capture.sensor, capture.laser).max(0)
         side = max(2, round(math.sqrt(capture.n_spots)))
@@ -128,30 +156,29 @@ def volume_grid(
     skip = tuple((w - (n - 1) * refine - 1) // 2 for w, n in zip(whole, counts, strict=True))
     origin = (first[0] - skip[0] * fine[0], first[1] - skip[1] * fine[1], first[2] + near)
     grid = VolumeGrid(origin, (*fine, pitch_z), (nz, *whole))
-    _check_window(capture, grid)
+    path_range(capture, grid)
     return grid
 
 
-def voxel_path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
-    """Shortest and longest laser-voxel-sensor path over all spots and voxels, m (bounds, not attained in general)."""
-    low = np.array([grid.x.min(), grid.y.min(), grid.z.min()])
-    high = np.array([grid.x.max(), grid.y.max(), grid.z.max()])
+def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
+    """Shortest and longest optical path, m, from laser through any voxel centre to sensor (bounds over the box).
 
-    def reach(points: np.ndarray) -> tuple[float, float]:
-        nearest = np.linalg.norm(points - np.clip(points, low, high), axis=1).min()
-        farthest = np.linalg.norm(np.maximum(np.abs(points - low), np.abs(points - high)), axis=1).max()
-        return float(nearest), float(farthest)
-
-    (near_l, far_l), (near_s, far_s) = reach(capture.laser), reach(capture.sensor)
-    return near_l + near_s, far_l + far_s
-
-
-def _check_window(capture: Capture, grid: VolumeGrid) -> None:
-    start, end = capture.path_gate
-    near, far = voxel_path_range(capture, grid)
-    if near >= end or far <= start:
-        raise UserError(
-            f"the volume (depth {grid.z[0]:.3g} to {grid.z[-1]:.3g} m, light paths {near:.3g} to {far:.3g} m) lies outside the "
-            f"capture's time window (paths {start:.3g} to {end:.3g} m); set scene.volume.depth within about "
-            f"{max(start, 0) / 2:.3g} to {end / 2:.3g} m, or check the bin width ({capture.bin_width_ps:.3g} ps)"
+    Raises:
+        CaptureError: no such path falls inside the capture's gate, so nothing of the volume was measured.
+    """
+    lower = np.array([min(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
+    upper = np.array([max(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
+    shortest, longest = 0.0, 0.0
+    for points in (capture.laser, capture.sensor):
+        below, above = lower - points, points - upper
+        shortest = shortest + np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
+        longest = longest + np.linalg.norm(np.maximum(np.abs(below), np.abs(above)), axis=1)
+    first, last = capture.path_gate
+    shortest, longest = float(np.min(shortest)), float(np.max(longest))
+    if shortest >= last or longest <= first:
+        raise CaptureError(
+            f"the volume (depth {grid.z.min():.3g} to {grid.z.max():.3g} m, light paths {shortest:.3g} to {longest:.3g} m) lies "
+            f"outside the capture's time window (paths {first:.3g} to {last:.3g} m); move the volume (scene.volume.depth, within about "
+            f"{max(first, 0) / 2:.3g} to {last / 2:.3g} m) or the gate, or check the bin width ({capture.bin_width_ps:.3g} ps)"
         )
+    return shortest, longest

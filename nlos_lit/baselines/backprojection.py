@@ -12,10 +12,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from nlos_lit.baselines.scan import gated_transients, path_range
+from nlos_lit.baselines.scan import gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
+from nlos_lit.scan import path_range
 
 _BLOCK = 1 << 19  # (spot, voxel) pairs at a time: they bound the memory, and few calls are made
 _SCRATCH = 64 << 20  # bytes that the allocator and the libraries were seen to keep besides

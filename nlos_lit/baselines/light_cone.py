@@ -15,10 +15,11 @@ import torch
 from scipy.fft import next_fast_len
 
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import confocal_lattice, gated_transients, path_range
+from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
+from nlos_lit.scan import path_range
 
 
 def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:

@@ -15,9 +15,10 @@ from scipy.fft import next_fast_len
 
 from nlos_lit.baselines.light_cone import gated_bins
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import confocal_lattice, gated_transients, path_range
+from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.grid import VolumeGrid
+from nlos_lit.scan import path_range
 
 _SCRATCH = 24 << 20  # bytes that the allocator and the libraries were seen to keep besides
 

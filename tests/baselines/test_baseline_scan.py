@@ -11,8 +11,9 @@ from baseline_scenes import box, capture_of, lattice
 
 from nlos_lit.baselines import METHODS, estimate_bytes, reconstruct
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import find_lattice, gated_transients, path_range
+from nlos_lit.baselines.scan import gated_transients
 from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
+from nlos_lit.scan import find_lattice, path_range
 
 WALL = lattice(6, 5, 0.1, 0.12, centre=(0.03, -0.2))
 GRID = box((-0.2, 0.2, 7), (-0.3, 0.1, 6), (0.3, 0.7, 9))
@@ -88,7 +89,7 @@ def test_path_range_bounds_every_path():
 @pytest.mark.parametrize("gate", [(0, 20), (110, 128)])
 def test_volume_outside_the_gate(method, gate):
     capture = capture_of(WALL, WALL, [POINT], 128, 0.02, gate=gate)
-    with pytest.raises(CaptureError, match=r"the volume lies at paths of 0\.600 to .* m, outside the gate"):
+    with pytest.raises(CaptureError, match=r"the volume \(depth .* light paths 0\.6 to .* m\) lies outside the capture's time window"):
         reconstruct(capture, GRID, method)
 
 
@@ -105,8 +106,8 @@ def test_gated_transients():
 
 def test_unknown_method_and_option():
     capture = capture_of(WALL, WALL, [POINT], 128, 0.02)
-    with pytest.raises(UserError, match="unknown method 'rsd'; choose one of bp, fbp, lct, fk"):
-        reconstruct(capture, GRID, "rsd")
+    with pytest.raises(UserError, match="unknown method 'mirror'; choose one of bp, fbp, lct, fk, rsd"):
+        reconstruct(capture, GRID, "mirror")
     with pytest.raises(UserError, match="method lct has no option 'sigma'; it takes snr, falloff"):
         reconstruct(capture, GRID, "lct", sigma=1.0)
 
@@ -122,6 +123,7 @@ def test_budget_is_checked_before_work(method, monkeypatch):
 
     for module in ("backprojection", "light_cone", "migration"):
         monkeypatch.setattr(f"nlos_lit.baselines.{module}.gated_transients", forbidden)
+    monkeypatch.setattr("nlos_lit.phasor.PhasorImaging.prepare", forbidden)
     with pytest.raises(MemoryBudgetError, match=f"method {method} needs .* GiB, above the budget of"):
         reconstruct(capture, GRID, method, budget_bytes=need - 1)
 
