@@ -53,13 +53,16 @@ def main(config: DictConfig) -> None:
             Scores(),
             history,
             Bar(),
-            Figures(monitor["figures_every"], shown_spots(run.capture.n_spots, monitor["spots"])),
-            ModelCheckpoint(folder / "checkpoints", save_last=True, every_n_epochs=monitor["checkpoint_every"], filename="iteration"),
+            Figures(monitor["figures_every"], shown_spots(run.capture.n_spots, monitor["spots"]), folder / "figures"),
+            ModelCheckpoint(
+                folder / "checkpoints", save_last=True, every_n_epochs=monitor["checkpoint_every"], filename="iteration"
+            ),
         ],
     )
     trainer.fit(run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None)
     if trainer.interrupted:
-        log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", settings["scene"]["name"], folder)
+        name = settings["scene"]["name"]
+        log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder)
         sys.exit(130)
     if not trainer.is_global_zero:
         return

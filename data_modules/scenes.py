@@ -43,7 +43,7 @@ def load_scene(scene: Mapping[str, Any], data_dir: str | Path, seed: int) -> tup
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
-    """The scene's file: ``path`` as given, else the file in ``data_dir``, else downloaded where a stable URL and a checksum exist."""
+    """The scene's file: ``path`` as given, else that in ``data_dir``, else downloaded where a URL and a checksum are known."""
     if scene["path"] is not None:
         path = Path(scene["path"])
         if not path.exists():
@@ -51,7 +51,9 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
         return path
     source = scene["source"]
     if source is None:
-        raise UserError(f"the scene '{scene['name']}' takes any capture file: give it as scene.path=FILE (docs/formats.md lists the formats)")
+        raise UserError(
+            f"the scene '{scene['name']}' takes any capture file: give it as scene.path=FILE (docs/formats.md lists the formats)"
+        )
     path = data_dir / source["file"]
     if path.exists():
         return path

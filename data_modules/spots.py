@@ -115,7 +115,8 @@ class CaptureDataModule(L.LightningDataModule):
         # A spot without a single gated count was not measured (figure 4 has a hole of 100): it says nothing about a model.
         measured = self.dataset.counts.sum(1).numpy() > 0
         if not measured.all():
-            log.warning("%d of %d spots hold no counts inside the gate; they are neither fitted nor scored", (~measured).sum(), len(held))
+            empty = int((~measured).sum())
+            log.warning("%d of %d spots hold no counts inside the gate; they are neither fitted nor scored", empty, len(held))
         self.train_spots = np.flatnonzero(~held & measured)
         self.heldout_spots = np.flatnonzero(held & measured if every else measured)
         for name, spots in (("to train on", self.train_spots), ("to hold out", self.heldout_spots)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -13,6 +14,7 @@ from nlos_lit import figures
 from nlos_lit.capture import Capture
 from nlos_lit.export import Points
 from nlos_lit.functional.march import trilinear
+from nlos_lit.losses import sparsity
 from nlos_lit.module import SelfCalibration
 from nlos_lit.progress import Ticker
 
@@ -34,7 +36,9 @@ class Scores(L.Callback):
         with torch.no_grad():
             volume = module.pipeline.phasor()
             regular = module.regularisation(volume, module.pipeline.albedo(volume))
-        return {**heldout, "loss": train["mse"] + sum(float(term) for term in regular.values()), "train_mse": train["mse"]}
+            clean = float(sparsity(volume))
+        loss = train["mse"] + sum(float(term) for term in regular.values())
+        return {**heldout, "loss": loss, "sparsity": clean, "train_mse": train["mse"]}
 
 
 class History(L.Callback):
@@ -91,18 +95,25 @@ class Bar(L.Callback):
 
 
 class Figures(L.Callback):
-    """Figures in TensorBoard: kernel, transients, volume, albedo, surface.
+    """Figures in TensorBoard: kernel, transients, volume, albedo, surface; the first volume also as a file.
 
     Args:
         every: iterations between figures; also before the first and after the last.
         spots: ``[K]`` spots whose transients are shown.
+        folder: where ``volume_first.png`` goes.
     """
 
-    def __init__(self, every: int, spots: np.ndarray) -> None:
-        self.every, self.spots = every, spots
+    def __init__(self, every: int, spots: np.ndarray, folder: Path) -> None:
+        self.every, self.spots, self.folder = every, spots, folder
 
     def on_train_start(self, trainer: L.Trainer, module: SelfCalibration) -> None:
         self._show(trainer, module)
+        if trainer.is_global_zero and trainer.current_epoch == 0:
+            with torch.no_grad():
+                volume = module.pipeline.phasor().cpu().numpy()
+            grid, threshold = module.pipeline.phasor.grid, module.pipeline.geometry.threshold
+            shown = figures.volume_projections(volume, grid, threshold=threshold, title="intensity before the first iteration")
+            figures.save_figure(shown, self.folder / "volume_first.png")
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: SelfCalibration) -> None:
         step = trainer.current_epoch + 1

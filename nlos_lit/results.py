@@ -69,6 +69,7 @@ def write_results(run: Run, history: History, folder: Path, total_seconds: float
             "train": {"initial": first["train_mse"], "final": last["train_mse"]},
             "heldout": {"initial": first["mse"], "final": last["mse"]},
         },
+        sparsity={"initial": first["sparsity"], "final": last["sparsity"]},
         iterations=len(history.seconds),
         ablation=config["ablation"]["name"],
         optimised=module.optimised,
