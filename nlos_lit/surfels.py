@@ -1,0 +1,282 @@
+"""The hidden surface as surfels, and the measurement they predict."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nlos_lit.capture import Capture
+from nlos_lit.export import Points
+from nlos_lit.functional.irf import convolve_time
+from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
+from nlos_lit.functional.surfel_paths import (
+    SPLINE_VARIANCE,
+    STEEP,
+    Paths,
+    SplineSplat,
+    quadrature,
+    spline_slopes,
+    spline_weights,
+    trace,
+)
+from nlos_lit.laser_sensor import LaserSensor
+from nlos_lit.parameters import BoundedParameter
+
+
+class Hooks:
+    """Where physical effects act; this base class does nothing at every stage. Shapes as in :meth:`SurfelModel.render`."""
+
+    def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        """``[B, M, Q]`` energy of each path."""
+        return contribution
+
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        """``[B, M, Q]`` optical length of each path, m."""
+        return length
+
+    def response(self, kernel: Tensor, lead: int) -> Tensor:
+        """``[L]`` temporal response, bin ``lead`` centred on the arrival."""
+        return kernel
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        """``[B, T]`` expected counts of the scene, before the background."""
+        return signal
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        """What is added to the signal, broadcastable to ``[B, T]``, counts per bin."""
+        return background
+
+
+class Columns(NamedTuple):
+    """Derivatives of the transients H_r (before the response) by each surfel's albedo and depth, sparse; normals held.
+
+    Element ``[b, m, q, k]`` belongs to bin ``first[b, m, q] + k`` of spot b, counted from the capture's bin 0; bins outside
+    ``[0, T)`` do not exist. ∂μ/∂θ is the response of the scattered values, see :meth:`SurfelModel.image`.
+    """
+
+    first: Tensor  # [B, M, Q] long
+    albedo: Tensor  # [B, M, Q, 4] ∂H_r/∂ρ
+    depth: Tensor  # [B, M, Q, 4] ∂H_r/∂z, 1/m
+
+
+class Lateral(NamedTuple):
+    """The lattice of lateral cells on which the front sheet is kept for the visibility test."""
+
+    origin: tuple[float, float]  # centre of cell [0, 0], m
+    pitch: tuple[float, float]  # signed, m
+    shape: tuple[int, int]
+
+
+class SurfelModel(nn.Module):
+    """Surfels with place, normal and albedo, and the laser-sensor response.
+
+    Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for that. "Depth" is the
+    place along it. State dicts are complete: :meth:`from_state` rebuilds the model with its number of surfels.
+
+    Args:
+        capture: for its wall points and time axis; its counts are not kept.
+        centre: ``[M, 3]`` m. normal: ``[M, 3]`` towards the wall's side. albedo: ``[M]`` > 0.
+        lateral: cells of the surfels.
+        laser_sensor: from :func:`spline_sensor`.
+        quadrature: points along each side of a surfel.
+    """
+
+    visible: Tensor
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        centre: Tensor,
+        normal: Tensor,
+        albedo: Tensor,
+        lateral: Lateral,
+        laser_sensor: LaserSensor,
+        quadrature: int = 2,
+    ) -> None:
+        super().__init__()
+        self.gate, self.n_bins = capture.gate, capture.gate[1]
+        self.bin_length, self.t_start, self.confocal = capture.bin_length, capture.t_start, capture.confocal
+        self.laser_sensor, self.quadrature, self.lateral = laser_sensor, quadrature, lateral
+        for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
+            self.register_buffer(name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False)
+        cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
+        self.register_buffer("cell", cell, persistent=False)
+        self.place(centre, normal, albedo)
+
+    def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
+        """Replace all surfels; they see every spot until :meth:`update_visibility`."""
+        device = self.laser.device
+        normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
+        steep = -normal[:, 2:] < STEEP
+        self.register_buffer("anchor", centre.to(device=device, dtype=torch.float32))
+        self.register_buffer("direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device)))
+        self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
+        # In units of a bin there and back, so that one learning rate suits every capture.
+        self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
+        self.raw_normal = nn.Parameter(normal)
+        self.raw_albedo = nn.Parameter(inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7)))
+        self.link()
+
+    def centre(self) -> Tensor:
+        """``[M, 3]`` m."""
+        return self.anchor + (self.raw_depth * (self.bin_length / 2))[:, None] * self.direction
+
+    def normal(self) -> Tensor:
+        """``[M, 3]`` unit, towards the wall's side."""
+        return torch.nn.functional.normalize(self.raw_normal, dim=1)
+
+    def albedo(self) -> Tensor:
+        """``[M]`` ≥ 0, relative to the response's intensity."""
+        return torch.nn.functional.softplus(self.raw_albedo)
+
+    @torch.no_grad()
+    def set_albedo(self, albedo: Tensor) -> None:
+        """Store albedos ``[M]``, in place."""
+        self.raw_albedo.copy_(inverse_softplus(albedo.clamp_min(1e-7)))
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+    @torch.no_grad()
+    def link(self) -> None:
+        """Find each surfel's neighbours on its sheet, for :meth:`bending`."""
+        normal = self.normal()
+        stretch = (1 / (-normal[:, 2]).clamp_min(STEEP)).clamp_max(2.0)
+        self.pairs = neighbour_pairs(self.centre(), normal, 1.6 * self.cell.max() * stretch)
+
+    def bending(self) -> Tensor:
+        """How badly normals and places of neighbours fit one surface, in squared radians summed over pairs."""
+        albedo = self.albedo().detach()
+        return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
+
+    @torch.no_grad()
+    def update_visibility(self, opaque: float = 0.3, skip: float = 1.5, samples: int = 32) -> None:
+        """Find from which wall points each surfel's centre is hidden by the front sheet of the others.
+
+        Args:
+            opaque: surfels of at least this share of the mean albedo hide. skip: cells before the surfel that do not.
+            samples: along each line of sight.
+        """
+        albedo, centre = self.albedo(), self.centre()
+        solid = albedo > opaque * albedo.mean()
+        origin, pitch = (
+            torch.tensor(v, dtype=torch.float32, device=centre.device) for v in (self.lateral.origin, self.lateral.pitch)
+        )
+        index = ((centre[solid, :2] - origin) / pitch).round().long()
+        sheet = front_sheet(index, centre[solid, 2], cells.shape)
+
+        def seen(wall: Tensor) -> Tensor:
+            points, row = torch.unique(wall, dim=0, return_inverse=True)
+            return clear_view(sheet, origin, pitch, points, centre, samples, skip)[row]
+
+        self.visible = seen(self.laser)
+        if not self.confocal:
+            self.visible &= seen(self.sensor)
+
+    def paths(self, spots: Tensor, centre: Tensor | None = None) -> Paths:
+        """Stage 1: all paths of ``spots`` ``[B]`` over all surfels (at ``centre`` where given), for unit albedo."""
+        walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
+        offsets = quadrature(self.quadrature, self.anchor.device)
+        paths = trace(self.centre() if centre is None else centre, self.normal(), self.cell, offsets, *walls, self.confocal)
+        if len(self.visible):
+            paths = paths._replace(contribution=paths.contribution * self.visible[spots][:, :, None])
+        return paths
+
+    def arrival(self, length: Tensor) -> Tensor:
+        """Stage 2: path length (m) as time in bins from the capture's bin 0."""
+        return (length - self.t_start) / self.bin_length
+
+    def transients(self, contribution: Tensor, time: Tensor) -> Tensor:
+        """Stage 3: ``[B, T]`` H_r from ``[B, M, Q]`` energies and times (bins)."""
+        return SplineSplat.apply(contribution.flatten(1), time.flatten(1), self.n_bins)
+
+    def image(self, transients: Tensor, hooks: Hooks | None = None) -> Tensor:
+        """Stage 4: ``[B, T]`` transients through the response, in counts (no background)."""
+        sensor = self.laser_sensor
+        kernel = sensor.kernel()
+        if hooks is not None:
+            kernel = hooks.response(kernel, sensor.lead)
+        return sensor.intensity() * convolve_time(transients, kernel, sensor.lead)
+
+    def render(self, spots: Tensor, hooks: Hooks | None = None) -> Tensor:
+        """``[B, T_gate]`` expected counts of ``spots`` ``[B]``: path → time → response → gain → background."""
+        paths = self.paths(spots)
+        energy, length = paths.contribution * self.albedo()[:, None], paths.length
+        if hooks is not None:
+            energy, length = hooks.path(energy, paths, spots), hooks.time(length, paths, spots)
+        signal = self.image(self.transients(energy, self.arrival(length)), hooks)
+        background = self.laser_sensor.background()
+        if hooks is not None:
+            signal, background = hooks.gain(signal, spots), hooks.background(background, spots)
+        return (signal + background)[:, self.gate[0] :]
+
+    forward = render
+
+    @torch.no_grad()
+    def expected(self, spots: Tensor) -> Tensor:
+        """:meth:`render` without gradients, in batches of about two million paths."""
+        size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
+        return torch.cat([self.render(part) for part in spots.split(size)])
+
+    def columns(self, spots: Tensor) -> Columns:
+        """Sparse ∂H_r/∂albedo and ∂H_r/∂depth of every surfel at ``spots`` ``[B]``; memory 13 numbers per path.
+
+        A path depends on its own surfel alone, so one forward-mode pass with all depths moving together gives every derivative.
+        """
+
+        def moved(shift: Tensor) -> tuple[Tensor, Tensor]:
+            paths = self.paths(spots, self.centre().detach() + shift[:, None] * self.direction)
+            return paths.contribution, self.arrival(paths.length)
+
+        rest = torch.zeros_like(self.raw_depth)
+        (energy, time), (d_energy, d_time) = torch.func.jvp(moved, (rest,), (torch.ones_like(rest),))
+        first, weights = spline_weights(time)
+        by_depth = d_energy[..., None] * weights + (energy * d_time)[..., None] * spline_slopes(time)
+        albedo = self.albedo().detach()[:, None, None]
+        return Columns(first, energy[..., None] * weights, albedo * by_depth)
+
+    def points(self) -> Points:
+        """Surfel centres with normals and albedo."""
+        arrays = (self.centre(), self.normal(), self.albedo())
+        return Points(*(a.detach().cpu().double().numpy() for a in arrays))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        response = {name: (p.lower, p.upper, p.unit) for name, p in self.laser_sensor.named_children()}
+        return {"response": response, "quadrature": self.quadrature, "lateral": tuple(self.lateral)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.quadrature = state["quadrature"]
+
+    @classmethod
+    def from_state(cls, capture: Capture, state: dict[str, Any]) -> SurfelModel:
+        """The model whose ``state_dict()`` this is, over the same capture."""
+        extra = state["_extra_state"]
+        middle = {name: (math.sqrt(low * high), low, high, unit) for name, (low, high, unit) in extra["response"].items()}
+        sensor = spline_sensor(capture, {name: BoundedParameter(*values) for name, values in middle.items()})
+        m = len(state["anchor"])
+        normal = torch.tensor([0.0, 0.0, -1.0]).expand(m, 3)
+        lateral = Lateral(*(tuple(v) for v in extra["lateral"]))
+        model = cls(capture, centre=state["anchor"], normal=normal, albedo=torch.ones(m), lateral=lateral, laser_sensor=sensor)
+        model.visible = torch.empty_like(state["visible"])
+        model.load_state_dict(state)
+        model.link()
+        return model
+
+
+def spline_sensor(capture: Capture, parameters: dict[str, BoundedParameter]) -> LaserSensor:
+    """A laser-sensor model for transients splatted by cubic B-splines, whose width it takes out of Ψ.
+
+    σ_ls cannot be below √(1/3 + 0.05²) = 0.58 bins.
+    """
+    sensor = LaserSensor(bin_length=capture.bin_length, n_bins=capture.gate[1], **parameters)
+    sensor.splat_variance = SPLINE_VARIANCE
+    return sensor
+
+
+def inverse_softplus(value: Tensor) -> Tensor:
+    """x with softplus(x) = value > 0."""
+    return value + torch.log(-torch.expm1(-value))
