@@ -163,9 +163,8 @@ class SurfelModel(nn.Module):
         """
         albedo, centre = self.albedo(), self.centre()
         solid = albedo > opaque * albedo.mean()
-        origin, pitch = (
-            torch.tensor(v, dtype=torch.float32, device=centre.device) for v in (self.lateral.origin, self.lateral.pitch)
-        )
+        cells = self.lateral
+        origin, pitch = (torch.tensor(v, dtype=torch.float32, device=centre.device) for v in (cells.origin, cells.pitch))
         index = ((centre[solid, :2] - origin) / pitch).round().long()
         sheet = front_sheet(index, centre[solid, 2], cells.shape)
 

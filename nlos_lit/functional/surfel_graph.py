@@ -18,8 +18,6 @@ def neighbour_pairs(centre: Tensor, normal: Tensor, reach: float, agree: float =
         part = slice(start, start + chunk)
         distance = torch.cdist(centre[part], centre, compute_mode="donot_use_mm_for_euclid_dist")
         near = (distance < reach[part, None]) & (normal[part] @ normal.T > agree)
-            normal[part] @ normal.T > agree
-        )
         i, j = torch.nonzero(near, as_tuple=True)
         i = i + start
         first.append(i[i != j])

@@ -1,7 +1,7 @@
 """Light paths over flat surface elements (surfels): throughput, length, and how they fill time bins.
 
-A surfel is a flat patch over a lateral cell, given by its centre and normal. Its path from the laser's wall point over the surfel to
-the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
+A surfel is a flat patch over a lateral cell, given by its centre and normal. Its path from the laser's wall point over the surfel
+to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
 
     K = A cosθ1 cosθ2 cosθ3 cosθ4 / (d1² d2²)      at length d1 + d2,
 
@@ -87,7 +87,7 @@ def trace(
 
 
 def _leg(points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]`` to points ``[M, Q]``."""
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]`` to the points."""
     dx, dy, dz = (p - wall[:, k, None, None] for k, p in enumerate(points))
     square = dx * dx + dy * dy + dz * dz
     n = normal[:, :, None, None]
