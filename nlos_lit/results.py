@@ -12,7 +12,7 @@ import torch
 from nlos_lit import figures
 from nlos_lit.callbacks import History, run_figures, surface_points
 from nlos_lit.export import write_json, write_points, write_volume
-from nlos_lit.geometry_metrics import depth_map, geometry_errors
+from nlos_lit.geometry_metrics import SurfaceTruth, depth_map, geometry_errors
 from nlos_lit.mesh import write_mesh
 from nlos_lit.runs import Run
 from nlos_lit.summary import build_summary
@@ -24,6 +24,18 @@ def shown_spots(n_spots: int, count: int) -> np.ndarray:
     """``count`` spots spread over the scan along a golden-ratio sequence (no row or column is favoured)."""
     golden = (np.arange(1, count + 1) * 0.6180339887498949) % 1.0
     return np.unique((golden * n_spots).astype(np.int64))
+
+
+def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
+    """Masks ``[nx, ny]`` of the bright and the dark half of the true albedos; None where there is one albedo."""
+    if truth.albedo is None:
+        return None
+    seen = np.isfinite(truth.albedo) & (truth.albedo > 0)
+    low, high = truth.albedo[seen].min(), truth.albedo[seen].max()
+    if high - low < 1e-3:
+        return None
+    bright = seen & (truth.albedo > (low + high) / 2)
+    return bright, seen & ~bright
 
 
 def write_results(run: Run, history: History, folder: Path, total_seconds: float) -> dict[str, Any]:
@@ -44,7 +56,7 @@ def write_results(run: Run, history: History, folder: Path, total_seconds: float
     shown = run_figures(module, capture, shown_spots(capture.n_spots, config["monitor"]["spots"]))
     if run.truth is not None and len(points):
         spacing = float(np.abs(grid.pitch[:2]).max())
-        geometry = geometry_errors(points, run.truth, lateral_tolerance=spacing).to_dict()
+        geometry = geometry_errors(points, run.truth, lateral_tolerance=spacing, regions=albedo_regions(run.truth)).to_dict()
         x, y = run.truth.x, run.truth.y
         shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)
     parameters = module.imaging_parameters()

@@ -14,6 +14,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 import torch
+from conftest import ROOT
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -21,7 +22,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nlos_lit.export import read_points, read_volume
 from nlos_lit.runs import open_run, prepare_run
 
-ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12", "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",

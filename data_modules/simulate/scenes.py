@@ -84,7 +84,8 @@ def strokes(
 def default_scene() -> Mesh:
     """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome (albedo 0.9).
 
-    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
+    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome reaches from
+    z = 0.68 to 0.86 m; the F hides it from part of the wall.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
     letter = strokes([line * READABLE for line in f], depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
