@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pooch
 
 from data_modules.readers import ReaderOptions, read_capture
@@ -73,7 +74,11 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
 
 
 def _options(reader: Mapping[str, Any]) -> ReaderOptions:
-    values = {name: tuple(v) if isinstance(v, list) else v for name, v in reader.items()}
+    values = dict(reader)
+    if isinstance(values["wall_size"], list):
+        values["wall_size"] = tuple(values["wall_size"])
+    if isinstance(values["scan_order"], list):
+        values["scan_order"] = np.array(values["scan_order"])
     return ReaderOptions(**values)
 
 

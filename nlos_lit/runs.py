@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from omegaconf import OmegaConf
 
@@ -64,9 +65,10 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
     pipeline = build_pipeline(capture, grid, PipelineSettings(**settings)).to(device)
     plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]))
     rays = settings["rays"] ** 2 * config["batch_spots"]
-    # Albedo with its gradient and Adam's two moments; dense ray tables; the march's chunk of samples.
-    estimated = plan.total_bytes + 16 * grid.n_voxels + 24 * rays + 600 * 2**20
-    check_machine(estimated, "this run")
+    # Beyond what the process holds already: albedo with its gradient and Adam's two moments, dense ray tables, a chunk of samples.
+    planned = plan.total_bytes + 16 * grid.n_voxels + 24 * rays + 400 * 2**20
+    check_machine(planned, "this run")
+    estimated = planned + psutil.Process().memory_info().rss
     log.info(
         "%s: %d spots x %d bins of %.3g ps, %s; volume %d x %d x %d voxels, depth %.3g to %.3g m",
         scene["name"], capture.n_spots, capture.n_bins, capture.bin_width_ps, capture.kind, *grid.shape[1:], grid.shape[0],
