@@ -60,6 +60,23 @@ def trilinear(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
     return (volume.reshape(-1)[index] * weight).sum(1)
 
 
+@torch.no_grad()
+def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
+    """:func:`trilinear` without gradients, several times faster: the interpolation is fused into one kernel.
+
+    The kernel is parallel over its batch only, so the points are dealt into as many batches as keep all threads busy.
+    """
+    nz, nx, ny = lattice.shape
+    batches = 4 * torch.get_num_threads() if volume.device.type == "cpu" else 1
+    size = torch.tensor([nx, ny, nz], device=points.device, dtype=points.dtype) - 1
+    unit = (points - lattice.origin) / (lattice.pitch * size.clamp_min(1)) * 2 - 1
+    missing = -len(unit) % batches
+    unit = torch.nn.functional.pad(unit[:, [1, 0, 2]], (0, 0, 0, missing)).view(batches, 1, 1, -1, 3)
+    field = volume[None, None].expand(batches, 1, nz, nx, ny)
+    values = torch.nn.functional.grid_sample(field, unit, align_corners=True, padding_mode="border").reshape(-1)
+    return values[: len(points)]
+
+
 def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
     """``[B, 3]`` (z, x, y) indices of bricks of ``size`` cells in which some corner voxel reaches ``threshold``.
 
@@ -132,7 +149,7 @@ def march(
             owner, rank = expand(count[pick])
             distance = (first[pick][owner] + rank + 0.5) * step
             points = origins[spot[pick]][owner] + distance[:, None] * direction[pick][owner]
-            value = trilinear(volume, points, lattice)
+            value = sample(volume, points, lattice)
             above = torch.nonzero(value >= threshold).squeeze(1)
             line = (spot[pick] * n * n + ray[pick])[owner[above]]
             peak.scatter_reduce_(0, line, value[above], "amax")
