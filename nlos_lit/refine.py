@@ -37,6 +37,7 @@ class RefineSettings:
         floor: seeds are local maxima of the image of at least this share of its largest value …
         significance: … whose Poisson score against the scan's mean transient exceeds this many standard deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
+        max_seeds: the most significant are kept.
         subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else 1.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has twice as many.
@@ -49,9 +50,10 @@ class RefineSettings:
         visibility: surfels hide one another.
     """
 
-    floor: float = 0.05
+    floor: float = 0.02
     significance: float = 5.0
-    per_cell: int = 3
+    per_cell: int = 6
+    max_seeds: int = 5000
     subdivide: int | None = None
     quadrature: int | None = None
     rounds: int = 4
@@ -63,8 +65,8 @@ class RefineSettings:
     response_rate: float = 0.03
     tie: float = 100.0
     prune: float = 1.5
-    grow: float = 4.0
-    test_spots: int = 384
+    grow: float = 3.5
+    test_spots: int = 512
     visibility: bool = True
 
     def __post_init__(self) -> None:
@@ -193,7 +195,10 @@ class _Fit:
         candidates, value = volume_maxima(intensity, grid, s.floor, s.per_cell, lateral)
         null = rank_one(self.counts)[self.tested]
         tested = score(candidates, capture, lateral.pitch, 1, sensor, self.counts[self.tested], null, train[self.tested])
-        keep = tested.significance * math.sqrt(len(train) / len(self.tested)) > s.significance
+        significance = tested.significance * math.sqrt(len(train) / len(self.tested))
+        keep = significance > s.significance
+        if int(keep.sum()) > s.max_seeds:
+            keep &= significance >= significance.topk(s.max_seeds).values[-1]
         if not keep.any():
             raise UserError(
                 f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold only noise, or "

@@ -175,6 +175,14 @@ def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Candid
     return Candidates((centre[:, None] + shift).reshape(-1, 3), normal[:, None].expand(-1, 8, 3).reshape(-1, 3))
 
 
+def facings(places: Candidates) -> Candidates:
+    """Each place with its own normal, facing the wall, and tilted by 60° to either side along x and y."""
+    tilt = 3**0.5 * torch.tensor(TILTS, device=places.centre.device)
+    menu = torch.nn.functional.normalize(torch.cat([tilt, -torch.ones_like(tilt[:, :1])], 1), dim=1)
+    normals = [places.normal, *(n.expand_as(places.normal) for n in menu)]
+    return Candidates(places.centre.repeat(len(normals), 1), torch.cat(normals))
+
+
 def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096) -> Tensor:
     """``[V]`` True where a surfel lies within ``reach`` (m) of the candidate."""
     if len(centre) == 0 or len(candidates) == 0:
@@ -199,6 +207,7 @@ def best_apart(centre: Tensor, value: Tensor, reach: float) -> Tensor:
     return order[torch.tensor(kept, dtype=torch.long, device=order.device)]
 
 
+TILTS = ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # tangents of the facings tried, in units of √3
 APART = 0.7  # surfels keep this many cells from each other
 FIRST_SHARE = 0.3  # of the one-step albedo: neighbours that grow together share the same residual
 
@@ -241,7 +250,7 @@ def prune_and_grow(
     places = Candidates(*(torch.cat(p) for p in zip(neighbour_candidates(*kept, model.cell), reserve, strict=True)))
     apart = APART * float(model.cell.max())
     free = ~occupied(places.centre, kept.centre, apart) & (places.centre[:, 2] > low) & (places.centre[:, 2] < high)
-    places = places.take(free)
+    places = facings(places.take(free))
     result = test(places, min(2, model.quadrature))
     wanted = result.significance * math.sqrt(scale) > grow
     places, result = places.take(wanted), Score(*(v[wanted] for v in result))

@@ -62,7 +62,7 @@ def clear_view(
     Args:
         sheet: ``[nx, ny]`` from :func:`front_sheet`. origin, pitch: ``[2]`` lateral centre of cell 0 and signed spacing, m.
         wall: ``[W, 3]``. target: ``[V, 3]`` m.
-        samples: along each line. skip: the last ``skip`` cells before the target are not looked at.
+        samples: along each line. skip: within this many cells of the target nothing hides it.
     """
     nx, ny = sheet.shape
     flat = torch.nn.functional.pad(sheet, (1, 1, 1, 1), value=torch.inf).reshape(-1)
@@ -70,8 +70,7 @@ def clear_view(
     rows = []
     for part in wall.split(max(1, chunk // (len(target) * samples))):
         d = target[None] - part[:, None]
-        cells = torch.linalg.vector_norm(d[..., :2] / pitch, dim=2, keepdim=True)
-        far = share * cells < cells - skip
+        far = (1 - share) * torch.linalg.vector_norm(d, dim=2, keepdim=True) > skip * pitch.abs().max()
         i = ((part[:, None, None, 0] + share * d[..., :1] - origin[0]) / pitch[0]).round().clamp(-1, nx).long() + 1
         j = ((part[:, None, None, 1] + share * d[..., 1:2] - origin[1]) / pitch[1]).round().clamp(-1, ny).long() + 1
         height = flat[i * (ny + 2) + j]
