@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 
+import numpy as np
 import pytest
 from conftest import ROOT
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from nlos_lit.build import PipelineSettings
+from nlos_lit.capture import Capture
+from nlos_lit.scan import volume_grid
 
 CONF = ROOT / "conf"
 
@@ -47,6 +50,25 @@ def test_the_papers_scenes_are_there_with_its_thresholds_and_iterations():
         config = composed(f"scene={scene}")["scene"]
         assert config["iterations"] == iterations
         assert config["threshold"] == (0.05 if scene in ("bunny", "dragon", "erato", "indonesian") else 0.2)
+
+
+def test_volumes_have_the_papers_numbers_of_planes():
+    table = {"bunny": 201, "dragon": 128, "erato": 128, "indonesian": 128, "34": 105, "bike": 64, "resolution": 26}
+    table |= {"44i": 417, "nlos": 417}
+    for scene, planes in table.items():
+        volume = composed(f"scene={scene}")["scene"]["volume"]
+        assert planes_of(volume) == planes
+    full = composed("scene=su", "scene.sum_bins=1", "scene.volume.depth_pitch=0.0012")["scene"]["volume"]
+    assert planes_of(full) == 584
+
+
+def planes_of(volume: dict) -> int:
+    near, far = volume["depth"]
+    capture = Capture(np.ones((4, 4)), *[CORNERS] * 2, *[np.tile([0.0, 0.0, 1.0], (4, 1))] * 2, bin_length=2.0)
+    return volume_grid(capture, depth=(near, far), depth_pitch=volume["depth_pitch"]).shape[0]
+
+
+CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], dtype=float)
 
 
 def leaves(config: dict, above: str = "") -> list[str]:
