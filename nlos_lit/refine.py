@@ -26,6 +26,7 @@ from nlos_lit.surfel_seed import prune_and_grow, rank_one, score, start_response
 from nlos_lit.surfels import Lateral, SurfelModel
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
+RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
 Progress = Callable[[int, int], None]
 
 
@@ -37,7 +38,7 @@ class RefineSettings:
         floor: seeds are local maxima of the image of at least this share of its largest value …
         significance: … whose Poisson score against the scan's mean transient exceeds this many standard deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
-        max_seeds: the most significant are kept.
+        max_seeds: the most significant are kept, and as many in reserve for growth.
         subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else 1.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has twice as many.
@@ -50,10 +51,10 @@ class RefineSettings:
         visibility: surfels hide one another.
     """
 
-    floor: float = 0.02
+    floor: float = 0.05
     significance: float = 5.0
     per_cell: int = 6
-    max_seeds: int = 5000
+    max_seeds: int = 3000
     subdivide: int | None = None
     quadrature: int | None = None
     rounds: int = 4
@@ -66,7 +67,7 @@ class RefineSettings:
     tie: float = 100.0
     prune: float = 1.5
     grow: float = 3.5
-    test_spots: int = 512
+    test_spots: int = 384
     visibility: bool = True
 
     def __post_init__(self) -> None:
@@ -192,11 +193,11 @@ class _Fit:
         sensor = start_response(capture, self.counts, start)
         self.order, self.place = self._permutation(), 0
         self.tested = self.order[: s.test_spots]
-        candidates, value = volume_maxima(intensity, grid, s.floor, s.per_cell, lateral)
+        candidates, value = volume_maxima(intensity, grid, RESERVE * s.floor, s.per_cell, lateral)
         null = rank_one(self.counts)[self.tested]
         tested = score(candidates, capture, lateral.pitch, 1, sensor, self.counts[self.tested], null, train[self.tested])
         significance = tested.significance * math.sqrt(len(train) / len(self.tested))
-        keep = significance > s.significance
+        keep = (significance > s.significance) & (value >= s.floor)
         if int(keep.sum()) > s.max_seeds:
             keep &= significance >= significance.topk(s.max_seeds).values[-1]
         if not keep.any():
@@ -204,7 +205,8 @@ class _Fit:
                 f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold only noise, or "
                 "scene.volume.depth or the gate misses the hidden scene (refine.significance sets the level)"
             )
-        self.reserve, seeds = candidates, candidates.take(keep)
+        best = significance.topk(min(s.max_seeds, len(significance))).indices
+        self.reserve, seeds = candidates.take(best), candidates.take(keep)
         step_bytes = int(keep.sum()) * points**2 * min(s.batch, len(train)) * BYTES_PER_PATH
         check_machine(step_bytes + 8 * self.counts.numel(), "one refinement step")
         self.model = SurfelModel(
@@ -289,6 +291,6 @@ def _normalise_albedo(model: SurfelModel) -> None:
     albedo = model.albedo()
     white = float(torch.quantile(albedo, 0.98))
     sensor = model.laser_sensor
-    value = float(sensor.intensity()) * white
+    value = sensor.intensity().item() * white
     sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
     model.set_albedo(albedo / white)

@@ -164,7 +164,7 @@ def score(
         # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information otherwise.
         f = (energy.sum(2) * (energy * (gather_bins(weight, time) * weights).sum(-1).view(shape)).sum(2)).sum(0)
         total[0, start : start + len(g)], total[1, start : start + len(g)] = g.double(), f.double()
-    gain = float(sensor.intensity())
+    gain = sensor.intensity().item()
     return Score(total[0] * gain, total[1] * gain**2)
 
 
@@ -251,7 +251,7 @@ def prune_and_grow(
     apart = APART * float(model.cell.max())
     free = ~occupied(places.centre, kept.centre, apart) & (places.centre[:, 2] > low) & (places.centre[:, 2] < high)
     places = facings(places.take(free))
-    result = test(places, min(2, model.quadrature))
+    result = test(places, 1)
     wanted = result.significance * math.sqrt(scale) > grow
     places, result = places.take(wanted), Score(*(v[wanted] for v in result))
     chosen = best_apart(places.centre, result.significance, apart)

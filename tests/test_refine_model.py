@@ -57,7 +57,7 @@ def build(capture, centre, normal=None, albedo=None, quadrature=1, sigma=1.0, ka
 def random_model(quadrature=2) -> tuple[SurfelModel, torch.Tensor]:
     rng = np.random.default_rng(3)
     capture = wall(rng.uniform(-0.4, 0.4, (5, 3)) * [1, 1, 0], rng.uniform(-0.4, 0.4, (5, 3)) * [1, 1, 0], gate=(40, 300))
-    centre = (rng.uniform(-0.3, 0.3, (7, 3)) + [0, 0, 0.8]).tolist()
+    centre = (rng.uniform(-0.3, 0.3, (7, 3)) + np.array([0, 0, 0.8])).tolist()
     normal = (rng.normal(0, 0.3, (7, 3)) + FACING).tolist()
     return build(capture, centre, normal, rng.uniform(0.2, 1.5, 7).tolist(), quadrature), torch.tensor([4, 0, 2])
 

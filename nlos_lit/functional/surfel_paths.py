@@ -110,8 +110,8 @@ def path_rates(
     sensor_normal: Tensor,
     confocal: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Derivatives of :func:`trace` when every surfel moves along its ``direction`` ``[M, 3]``: of the contribution's logarithm (1/m)
-    and of the length (m per m), both ``[B, M, Q]``. A path depends on its own surfel alone."""
+    """Derivatives of :func:`trace` when every surfel moves along its ``direction`` ``[M, 3]``, both ``[B, M, Q]``: of the
+    contribution's logarithm (1/m) and of the length (m per m). A path depends on its own surfel alone."""
     shift, _ = spread(normal, cell, offsets)
     points = (centre[:, None] + shift).unbind(2)
     rate, length = _leg_rate(points, normal, direction, laser, laser_normal)
@@ -122,7 +122,7 @@ def path_rates(
 
 
 def _leg_rate(points: tuple[Tensor, ...], facing: Tensor, direction: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Along ``direction``: derivative of ln(cosθ_wall cosθ_surfel / d²) and of d, each ``[B, M, Q]``; where a cosine is 0 it stays 0."""
+    """Along ``direction``: derivatives of ln(cosθ_wall cosθ_surfel / d²) and of d, each ``[B, M, Q]``."""
     d = torch.stack([p - wall[:, k, None, None] for k, p in enumerate(points)], -1)
     square = (d * d).sum(-1)
     away = (d * direction[:, None]).sum(-1)
