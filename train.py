@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 
 from nlos_lit.callbacks import Bar, Figures, History, Scores
 from nlos_lit.command import quiet_libraries, quote_numbers, refuse_finished_folder, sentence_errors, write_config
-from nlos_lit.results import shown_spots, write_results
+from nlos_lit.results import refine_run, shown_spots, write_results
 from nlos_lit.runs import find_checkpoint, prepare_run
 
 log = logging.getLogger(__name__)
@@ -66,12 +66,15 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
     if not trainer.is_global_zero:
         return
-    summary = write_results(run, history, folder, time.perf_counter() - began)
+    refined = refine_run(run, folder) if settings["refine"] else None
+    summary = write_results(run, history, folder, time.perf_counter() - began, refined)
     nmse = summary["heldout"]["nmse"]
     log.info(
         "held-out NMSE %.4f -> %.4f (noise %.4f), loss %.3e -> %.3e; results in %s",
         nmse["initial"], nmse["final"], nmse["noise_floor"], summary["loss"]["initial"], summary["loss"]["final"], folder,
     )  # fmt: skip
+    if refined is not None:
+        log.info("refined by %d surfels: held-out NMSE %.4f", refined["surfels"], refined["heldout"]["nmse"])
 
 
 if __name__ == "__main__":

@@ -139,18 +139,22 @@ def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) ->
     psi = sensor.kernel().cpu().numpy()
     start = capture.path_gate[0]
     path = start + (np.arange(rendering.expected.shape[1]) + 0.5) * capture.bin_length
-    scanned, name = (capture.laser, "laser") if capture.kind == "single_sensor" else (capture.sensor, "spot")
-    labels = [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
     measured = capture.gated_counts()[spots]
     threshold = pipeline.geometry.threshold
     return {
         "volume": figures.volume_projections(volume, grid, threshold=threshold, title="intensity"),
         "albedo": figures.albedo_projection(albedo, volume >= threshold, grid),
-        "transients": figures.transients_plot(measured, rendering.expected.cpu().numpy(), path, labels),
+        "transients": figures.transients_plot(measured, rendering.expected.cpu().numpy(), path, spot_labels(capture, spots)),
         "kernel": figures.kernel_plot(float(pipeline.phasor.omega_pf()), float(pipeline.phasor.sigma_pf())),
         "laser_sensor": figures.laser_sensor_plot(psi, capture.bin_length, first=-sensor.lead * capture.bin_length),
         "surface": figures.surface_plot(surface_points(module, capture, spots)),
     }
+
+
+def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
+    """Where each spot is on the wall, for panels of transients."""
+    scanned, name = (capture.laser, "laser") if capture.kind == "single_sensor" else (capture.sensor, "spot")
+    return [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
 
 
 @torch.no_grad()

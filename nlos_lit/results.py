@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 import torch
 
 from nlos_lit import figures
-from nlos_lit.callbacks import History, run_figures, surface_points
-from nlos_lit.export import write_json, write_points, write_volume
+from nlos_lit.callbacks import History, run_figures, spot_labels, surface_points
+from nlos_lit.export import Points, whole_file, write_json, write_points, write_volume
 from nlos_lit.geometry_metrics import SurfaceTruth, depth_map, geometry_errors
 from nlos_lit.mesh import write_mesh
+from nlos_lit.progress import planes_progress
+from nlos_lit.refine import RefineSettings, refine, score_spots
 from nlos_lit.runs import Run
 from nlos_lit.summary import build_summary
 
@@ -38,7 +41,51 @@ def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
     return bright, seen & ~bright
 
 
-def write_results(run: Run, history: History, folder: Path, total_seconds: float) -> dict[str, Any]:
+def refine_run(run: Run, folder: Path) -> dict[str, Any]:
+    """Fit surfels to the training spots from the run's image; points, mesh, figures and model in ``refined/``.
+
+    Returns the summary's entry: scores on all held-out spots, imaging parameters, geometry errors where the truth is known.
+    """
+    module, capture, place = run.module, run.capture, folder / "refined"
+    grid = module.pipeline.phasor.grid
+    with torch.no_grad():
+        intensity = module.pipeline.phasor().cpu()
+    settings = RefineSettings(**run.config["surfels"])
+    with planes_progress("refining surfels") as progress:
+        refined = refine(capture, intensity, grid, settings, run.data.train_spots, progress=progress, seed=run.config["seed"])
+    points = refined.points()
+    write_points(place / "points.ply", points)
+    mesh = write_mesh(place / "mesh.ply", points, depth=run.config["export"]["mesh_depth"])
+    with whole_file(place / "surfels.pt") as temporary:
+        torch.save(refined.model.state_dict(), temporary)
+    spots = shown_spots(capture.n_spots, run.config["monitor"]["spots"])
+    path = capture.path_gate[0] + (np.arange(capture.gate[1] - capture.gate[0]) + 0.5) * capture.bin_length
+    with torch.no_grad():
+        rendered = refined.expected(torch.from_numpy(spots)).numpy()
+    shown = figures.transients_plot(capture.gated_counts()[spots], rendered, path, spot_labels(capture, spots))
+    figures.save_figure(shown, place / "transients.png")
+    figures.save_figure(figures.surface_plot(points), place / "surface.png")
+    heldout = score_spots(refined.model, capture, torch.from_numpy(run.data.heldout_spots))
+    return {
+        "surfels": len(refined.model),
+        "heldout": dataclasses.asdict(heldout),
+        "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in refined.parameters.items()},
+        "geometry": _geometry(points, run),
+        "seconds": refined.seconds,
+        "mesh": {"vertices": mesh.vertices, "triangles": mesh.triangles, "reason": mesh.reason},
+    }
+
+
+def _geometry(points: Points, run: Run) -> dict[str, float] | None:
+    if run.truth is None or len(points) == 0:
+        return None
+    spacing = float(np.abs(run.module.pipeline.phasor.grid.pitch[:2]).max())
+    return geometry_errors(points, run.truth, lateral_tolerance=spacing, regions=albedo_regions(run.truth)).to_dict()
+
+
+def write_results(
+    run: Run, history: History, folder: Path, total_seconds: float, refined: dict[str, Any] | None = None
+) -> dict[str, Any]:
     """Volume, points, mesh, figures and ``summary.json``; returns the summary."""
     module, capture, config = run.module, run.capture, run.config
     pipeline = module.pipeline
@@ -52,11 +99,9 @@ def write_results(run: Run, history: History, folder: Path, total_seconds: float
     mesh = write_mesh(folder / "mesh.ply", points, depth=config["export"]["mesh_depth"])
     if mesh.reason:
         log.warning("mesh.ply: %s", mesh.reason)
-    geometry = None
+    geometry = _geometry(points, run)
     shown = run_figures(module, capture, shown_spots(capture.n_spots, config["monitor"]["spots"]))
-    if run.truth is not None and len(points):
-        spacing = float(np.abs(grid.pitch[:2]).max())
-        geometry = geometry_errors(points, run.truth, lateral_tolerance=spacing, regions=albedo_regions(run.truth)).to_dict()
+    if geometry is not None:
         x, y = run.truth.x, run.truth.y
         shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)
     parameters = module.imaging_parameters()
@@ -77,6 +122,7 @@ def write_results(run: Run, history: History, folder: Path, total_seconds: float
         parameters={name: (entry["value"], entry["unit"]) for name, entry in parameters.items()},
         seconds=(run.setup_seconds, float(np.median(history.seconds)) if history.seconds else float("nan"), total_seconds),
         geometry=geometry,
+        refined=refined,
         transient_mse={
             "train": {"initial": first["train_mse"], "final": last["train_mse"]},
             "heldout": {"initial": first["mse"], "final": last["mse"]},

@@ -178,7 +178,8 @@ def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
     if shortest >= last or longest <= first:
         raise CaptureError(
             f"the volume (depth {grid.z.min():.3g} to {grid.z.max():.3g} m, light paths {shortest:.3g} to {longest:.3g} m) lies "
-            f"outside the capture's time window (paths {first:.3g} to {last:.3g} m); move the volume (scene.volume.depth, within "
-            f"about {max(first, 0) / 2:.3g} to {last / 2:.3g} m) or the gate, or check the bin width ({capture.bin_width_ps:.3g} ps)"
+            f"outside the capture's time window (paths {first:.3g} to {last:.3g} m); move the volume (scene.volume.depth, "
+            f"within about {max(first, 0) / 2:.3g} to {last / 2:.3g} m) or the gate, or check the bin width "
+            f"({capture.bin_width_ps:.3g} ps)"
         )
     return shortest, longest

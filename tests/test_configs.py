@@ -29,7 +29,7 @@ def composed(*overrides: str, command: str = "train") -> dict:
 
 
 @pytest.mark.parametrize(
-    ("group", "name"), [(g, n) for g in ("scene", "model", "ablation", "trainer", "logger", "experiment") for n in names(g)]
+    ("group", "name"), [(g, n) for g in ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels") for n in names(g)]
 )
 def test_every_config_composes(group, name):
     config = composed(f"{group}={name}")

@@ -49,7 +49,7 @@ def state(folder: Path) -> dict:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "one"
-    train("scene.iterations=6", folder=folder)
+    train("scene.iterations=6", "refine=true", "surfels.rounds=2", "surfels.steps=40", folder=folder)
     return folder
 
 
@@ -75,6 +75,15 @@ def test_run_leaves_everything_a_later_command_needs(finished):
     assert cloud.point.positions.shape[0] == len(points)
     for name in ("volume", "albedo", "transients", "kernel", "laser_sensor", "surface", "loss", "parameters", "depth_error"):
         assert (finished / "figures" / f"{name}.png").stat().st_size > 5000
+
+
+def test_refinement_is_exported_like_any_other_result(finished):
+    refined = json.loads((finished / "summary.json").read_text())["refined"]
+    phasor = json.loads((finished / "summary.json").read_text())["heldout"]
+    assert refined["heldout"]["nmse"] < phasor["nmse"]["final"]
+    assert refined["geometry"]["depth_median_abs"] < 0.05
+    assert len(read_points(finished / "refined" / "points.ply")) == refined["surfels"]
+    assert {path.name for path in (finished / "refined").iterdir()} >= {"points.ply", "surfels.pt", "transients.png", "surface.png"}
 
 
 def test_tensorboard_events_hold_losses_parameters_and_figures(finished):
