@@ -254,7 +254,8 @@ def prune_and_grow(
     result = test(places, 1)
     wanted = result.significance * math.sqrt(scale) > grow
     places, result = places.take(wanted), Score(*(v[wanted] for v in result))
-    chosen = best_apart(places.centre, result.significance, apart)
+    # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to explain it otherwise.
+    chosen = best_apart(places.centre, result.significance, apart)[: max(20, len(albedo) // 5)]
     start = (FIRST_SHARE * result.score / result.information)[chosen].float().clamp(1e-3 * albedo.mean(), albedo.mean())
     new = places.take(chosen)
     model.place(torch.cat([kept.centre, new.centre]), torch.cat([kept.normal, new.normal]), torch.cat([albedo, start]))
