@@ -45,7 +45,7 @@ def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
 
 
 class SpotDataset(Dataset):
-    """Row ``s`` is spot ``s`` with its gated counts ``[T]`` as float32."""
+    """Item ``[s, …]`` is the batch of those spots: their numbers and gated counts ``[S, T]`` as float32."""
 
     def __init__(self, capture: Capture) -> None:
         self.counts = torch.from_numpy(capture.gated_counts())
@@ -53,7 +53,7 @@ class SpotDataset(Dataset):
     def __len__(self) -> int:
         return len(self.counts)
 
-    def __getitems__(self, spots: list[int]) -> dict[str, torch.Tensor]:
+    def __getitem__(self, spots: list[int]) -> dict[str, torch.Tensor]:
         index = torch.tensor(spots)
         return {"spots": index, "counts": self.counts[index]}
 
@@ -127,7 +127,8 @@ class CaptureDataModule(L.LightningDataModule):
         self.reference = np.sort(rng.permutation(self.train_spots)[:monitor_spots])
 
     def _loader(self, sampler: Sampler) -> DataLoader:
-        return DataLoader(self.dataset, batch_sampler=sampler, collate_fn=lambda batch: batch)
+        # As `sampler` (not `batch_sampler`), because that is where Lightning announces the epoch.
+        return DataLoader(self.dataset, sampler=sampler, batch_size=None)
 
     def _place(self) -> tuple[int, int]:
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 
+import lightning as L
 import numpy as np
 import pytest
+import torch
 
 from data_modules.spots import CaptureDataModule, SpotBatches, SpotSchedule, heldout_mask
 from nlos_lit.capture import Capture
+from nlos_lit.command import quiet_libraries
 from nlos_lit.errors import UserError
 
 
@@ -85,6 +88,42 @@ def test_ranks_share_the_batch_of_one_process():
         SpotSchedule(np.arange(50), 8, seed=5, rank=0, ranks=3)
 
 
+class Recorder(L.LightningModule):
+    """A model that notes which spots each iteration brought."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(()))
+        self.seen: list[list[int]] = []
+
+    def training_step(self, batch: dict[str, torch.Tensor], _: int) -> torch.Tensor:
+        self.seen.append(batch["spots"].tolist())
+        return self.weight * batch["counts"].mean()
+
+    def validation_step(self, *_: object) -> None:
+        """Nothing to score."""
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def test_a_trainer_brings_another_batch_each_iteration(tmp_path):
+    data, recorder = module(capture()), Recorder()
+    quiet_libraries()
+    trainer = L.Trainer(
+        max_epochs=5, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, default_root_dir=tmp_path,
+    )  # fmt: skip
+    trainer.fit(recorder, datamodule=data)
+    schedule = SpotSchedule(data.train_spots, 6, seed=3)
+    expected = []
+    for epoch in range(5):
+        schedule.set_epoch(epoch)
+        expected += list(schedule)
+    assert recorder.seen == expected
+    assert len({tuple(batch) for batch in expected}) == 5
+
+
 def test_scoring_visits_every_spot_once_over_the_ranks():
     parts = [list(SpotBatches(np.arange(17), 4, rank=r, ranks=2)) for r in range(2)]
     assert sorted(s for part in parts for batch in part for s in batch) == list(range(17))
@@ -92,7 +131,7 @@ def test_scoring_visits_every_spot_once_over_the_ranks():
 
 def test_batches_hold_the_gated_counts_of_their_spots():
     measured = capture().with_gate(1, 3)
-    batch = module(measured).dataset.__getitems__([5, 2])
+    batch = module(measured).dataset[[5, 2]]
     assert batch["counts"].tolist() == [[22, 23], [10, 11]]
     assert batch["spots"].tolist() == [5, 2]
 
