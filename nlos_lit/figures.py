@@ -227,7 +227,7 @@ def transients_plot(
             axes.fill_between(path, band[0][k], band[1][k], color=ORANGE, alpha=0.4, linewidth=0, step="mid", label="noise")
         axes.text(0.01, 0.95, labels[k], transform=axes.transAxes, ha="left", va="top")
         axes.set(ylabel="counts", xlim=(path[0], path[-1]))
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.3 * max(np.max(measured[k]), np.max(rendered[k]), 1e-12))  # headroom for the label
         if k < columns:
             _upper_time_axis(axes, 1.0, 1e9, "time (ns)")
         if k + columns >= len(measured):

@@ -31,7 +31,7 @@ def _tracked() -> list[str]:
 TRACKED = _tracked()
 MODULES = [name for name in TRACKED if name.endswith(".py")]
 PRODUCT = [name for name in MODULES if not name.startswith("tests/")]
-CORE = [name for name in MODULES if name in SUBMODULES or {"functional", "baselines"} & set(Path(name).parts[:-1])]
+CORE = [name for name in PRODUCT if name in SUBMODULES or {"functional", "baselines"} & set(Path(name).parts[:-1])]
 
 
 def syntax(name: str) -> ast.Module:

@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 import torch
 from conftest import ROOT
@@ -71,6 +70,8 @@ def test_run_leaves_everything_a_later_command_needs(finished):
     assert values.max() == pytest.approx(1)
     points = read_points(finished / "points.ply")
     assert len(points) > 100
+    import open3d as o3d
+
     cloud = o3d.t.io.read_point_cloud(str(finished / "points.ply"))
     assert cloud.point.positions.shape[0] == len(points)
     for name in ("volume", "albedo", "transients", "kernel", "laser_sensor", "surface", "loss", "parameters", "depth_error"):
@@ -140,14 +141,16 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     assert two["iterations"] == 6
 
 
-def test_two_processes_give_the_single_process_result(finished, tmp_path):
-    folder = tmp_path / "ddp"
-    train("scene.iterations=6", "trainer=ddp", folder=folder)
-    together, alone = state(folder)["state_dict"], state(finished)["state_dict"]
-    for name in alone:
-        difference = (together[name] - alone[name]).abs().max()
-        assert difference <= 2e-3 * alone[name].abs().max() + 1e-4, (name, float(difference))
-    one, two = (json.loads((f / "summary.json").read_text())["heldout"] for f in (finished, folder))
+def test_two_processes_give_the_single_process_result(tmp_path):
+    """One iteration agrees to rounding. Later a ray's largest sample may flip between two near ties, so six agree to 1 %."""
+    for iterations, tolerance in ((1, 1e-6), (6, 1e-2)):
+        alone, together = tmp_path / f"alone{iterations}", tmp_path / f"together{iterations}"
+        train(f"scene.iterations={iterations}", "logger=none", folder=alone)
+        train(f"scene.iterations={iterations}", "logger=none", "trainer=ddp", folder=together)
+        one, two = state(alone)["state_dict"], state(together)["state_dict"]
+        for name in one:
+            assert (two[name] - one[name]).norm() <= tolerance * one[name].norm(), name
+    one, two = (json.loads((f / "summary.json").read_text())["heldout"] for f in (alone, together))
     assert two["nmse"]["final"] == pytest.approx(one["nmse"]["final"], rel=1e-3)
     assert two["deviance_per_bin"]["initial"] == pytest.approx(one["deviance_per_bin"]["initial"], rel=1e-5)
 
