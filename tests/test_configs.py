@@ -28,9 +28,10 @@ def composed(*overrides: str, command: str = "train") -> dict:
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
-@pytest.mark.parametrize(
-    ("group", "name"), [(g, n) for g in ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels") for n in names(g)]
-)
+GROUPS = ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels")
+
+
+@pytest.mark.parametrize(("group", "name"), [(g, n) for g in GROUPS for n in names(g)])
 def test_every_config_composes(group, name):
     config = composed(f"{group}={name}")
     assert config["scene"]["volume"]["depth"][0] < config["scene"]["volume"]["depth"][1]

@@ -89,7 +89,8 @@ def test_path_range_bounds_every_path():
 @pytest.mark.parametrize("gate", [(0, 20), (110, 128)])
 def test_volume_outside_the_gate(method, gate):
     capture = capture_of(WALL, WALL, [POINT], 128, 0.02, gate=gate)
-    with pytest.raises(CaptureError, match=r"the volume \(depth .* light paths 0\.6 to .* m\) lies outside the capture's time window"):
+    sentence = r"the volume \(depth .* light paths 0\.6 to .* m\) lies outside the capture's time window"
+    with pytest.raises(CaptureError, match=sentence):
         reconstruct(capture, GRID, method)
 
 
