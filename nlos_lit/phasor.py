@@ -92,9 +92,10 @@ class PhasorImaging(nn.Module):
         Raises:
             MemoryBudgetError: not even half precision fits ``memory_budget`` bytes.
         """
-        self.omega = self._frequencies(capture)
+        omega = self._frequencies(capture)
         bounds = (self.omega_pf.lower, self.omega_pf.upper), (self.sigma_pf.lower, self.sigma_pf.upper)
-        self.basis = F.weight_basis(self.omega, *bounds, self.tolerance)
+        device = self.gain.device
+        self.omega, self.basis = omega.to(device), F.weight_basis(omega, *bounds, self.tolerance).to(device)
         n_freq, rank = self.basis.shape
         layout = self._layout(capture)
         if layout is None:

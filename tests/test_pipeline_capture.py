@@ -290,3 +290,10 @@ def test_a_scatterer_is_imaged_where_it_is(kind):
         k, i, j = np.unravel_index(int(phasor().argmax()), grid.shape)
     found = np.array([grid.x[i], grid.y[j], grid.z[k]])
     assert (np.abs(found - SCATTERER) <= 0.5 * np.abs(grid.pitch) + 1e-9).all()
+
+
+def test_everything_made_by_planning_lies_on_the_modules_device():
+    """Stands in for a GPU: on the meta device a tensor left behind on the CPU cannot be combined with the others."""
+    phasor = imaging(VolumeGrid((-0.2, 0.1, 0.3), (0.1, 0.2, 0.01), (4, 4, 3))).to("meta")
+    phasor.plan(Capture(**fields()), 1 << 40)
+    assert phasor.omega.device.type == phasor.basis.device.type == "meta"

@@ -22,8 +22,8 @@ def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> T
 
 def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
     """``U[f, s] = Σ_t H[s, t] e^{iΩ_f t}``; counts ``[S, T]``, time of bin centres ``[T]`` m, omega ``[F]`` rad/m."""
-    phase = omega.double()[:, None] * time.double()
-    kernel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64).to(counts.device)
+    phase = omega.double().to(counts.device)[:, None] * time.double().to(counts.device)
+    kernel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
     real = counts.to(torch.float32).T.contiguous()
     return torch.complex(kernel.real @ real, kernel.imag @ real)
 
