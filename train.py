@@ -59,8 +59,9 @@ def main(config: DictConfig) -> None:
             ),
         ],
     )
-    trainer.fit(run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None)
-    if trainer.interrupted:
+    try:
+        trainer.fit(run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None)
+    except SystemExit:  # Lightning's answer to Ctrl-C
         name = settings["scene"]["name"]
         log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder)
         sys.exit(130)

@@ -119,7 +119,7 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     folder = tmp_path / "resumed"
     process = subprocess.Popen(
         [sys.executable, "train.py", *SMALL, "scene.iterations=6", "logger=none", f"hydra.run.dir={folder}"],
-        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
     checkpoint = folder / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 300
@@ -128,7 +128,9 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    process.wait(timeout=120)
+    output, _ = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert f"interrupted; go on with: python train.py scene=default ckpt_path=last hydra.run.dir={folder}" in output
     assert not (folder / "summary.json").exists()
     assert state(folder)["epoch"] < 5
     train("scene.iterations=6", "logger=none", "ckpt_path=last", folder=folder)
