@@ -17,6 +17,7 @@ from nlos_lit import figures
 from nlos_lit.baselines import estimate_bytes, reconstruct
 from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
 from nlos_lit.export import write_json, write_volume
+from nlos_lit.geometry_metrics import depth_at
 from nlos_lit.memory import check_machine, parse_bytes
 from nlos_lit.scan import volume_grid
 from nlos_lit.summary import git_state, peak_memory_bytes, versions
@@ -63,8 +64,6 @@ def main(config: DictConfig) -> None:
 
 def front_errors(front: np.ndarray, truth, grid) -> dict[str, float]:
     """Errors of the depth of the maximum along z, ``[nx, ny]`` m with NaN where nothing was found, against the truth."""
-    from nlos_lit.geometry_metrics import depth_at
-
     x, y = np.meshgrid(grid.x, grid.y, indexing="ij")
     depth = depth_at(truth, np.stack([x.ravel(), y.ravel()], axis=1))[0].reshape(x.shape)
     both = np.isfinite(front) & np.isfinite(depth)

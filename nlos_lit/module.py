@@ -106,7 +106,7 @@ class SelfCalibration(L.LightningModule):
     @torch.no_grad()
     def score(self, batches: Any) -> dict[str, float]:
         """NMSE, deviance per bin and their noise levels over this rank's ``batches``, summed over ranks."""
-        self._sums = torch.zeros(6, dtype=torch.float64, device=self.device)
+        self.on_validation_epoch_start()
         for batch in batches:
             self._add_score({name: value.to(self.device) for name, value in batch.items()})
         return self._finish_score()
