@@ -38,8 +38,12 @@ class Hooks:
         """``[B, M, Q]`` optical length of each path, m."""
         return length
 
+    def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        """``[B, T]`` light on arrival, before the response; ``energy`` ``[B, M, Q]`` is that of the paths."""
+        return transients
+
     def response(self, kernel: Tensor, lead: int) -> Tensor:
-        """``[L]`` temporal response, bin ``lead`` centred on the arrival."""
+        """``[L]`` temporal response, bin ``lead`` centred on the arrival; may be returned longer."""
         return kernel
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
@@ -49,6 +53,13 @@ class Hooks:
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         """What is added to the signal, broadcastable to ``[B, T]``, counts per bin."""
         return background
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        """``[B, T]`` counts that are recorded of ``expected`` photons."""
+        return expected
+
+
+NOTHING = Hooks()
 
 
 class Columns(NamedTuple):
@@ -190,37 +201,31 @@ class SurfelModel(nn.Module):
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""
         return (length - self.t_start) / self.bin_length
 
-    def transients(self, contribution: Tensor, time: Tensor) -> Tensor:
-        """Stage 3: ``[B, T]`` H_r from ``[B, M, Q]`` energies and times (bins)."""
-        return SplineSplat.apply(contribution.flatten(1), time.flatten(1), self.n_bins)
+    def transients(self, paths: Paths, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stages 2 and 3: ``[B, T]`` light on arrival, H_r."""
+        energy, length = hooks.path(paths.contribution * self.albedo()[:, None], paths, spots), hooks.time(paths.length, paths, spots)
+        transients = SplineSplat.apply(energy.flatten(1), self.arrival(length).flatten(1), self.n_bins)
+        return hooks.transients(transients, energy, paths, spots)
 
-    def image(self, transients: Tensor, hooks: Hooks | None = None) -> Tensor:
-        """Stage 4: ``[B, T]`` transients through the response, in counts (no background)."""
+    def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stage 4: ``[B, T]`` expected counts from ``[B, T]`` transients: response → gain → background → counting."""
         sensor = self.laser_sensor
-        kernel = sensor.kernel()
-        if hooks is not None:
-            kernel = hooks.response(kernel, sensor.lead)
-        return sensor.intensity() * convolve_time(transients, kernel, sensor.lead)
+        kernel = hooks.response(sensor.kernel(), sensor.lead)
+        signal = hooks.gain(sensor.intensity() * convolve_time(transients, kernel, sensor.lead), spots)
+        return hooks.counting(signal + hooks.background(sensor.background(), spots), spots)
 
-    def render(self, spots: Tensor, hooks: Hooks | None = None) -> Tensor:
-        """``[B, T_gate]`` expected counts of ``spots`` ``[B]``: path → time → response → gain → background."""
-        paths = self.paths(spots)
-        energy, length = paths.contribution * self.albedo()[:, None], paths.length
-        if hooks is not None:
-            energy, length = hooks.path(energy, paths, spots), hooks.time(length, paths, spots)
-        signal = self.image(self.transients(energy, self.arrival(length)), hooks)
-        background = self.laser_sensor.background()
-        if hooks is not None:
-            signal, background = hooks.gain(signal, spots), hooks.background(background, spots)
-        return (signal + background)[:, self.gate[0] :]
+    def render(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+        """``[B, T_gate]`` expected counts of ``spots`` ``[B]``."""
+        transients = self.transients(self.paths(spots), spots, hooks)
+        return self.record(transients, spots, hooks)[:, self.gate[0] :]
 
     forward = render
 
     @torch.no_grad()
-    def expected(self, spots: Tensor) -> Tensor:
+    def expected(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
         """:meth:`render` without gradients, in batches of about two million paths."""
         size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
-        return torch.cat([self.render(part) for part in spots.split(size)])
+        return torch.cat([self.render(part, hooks) for part in spots.split(size)])
 
     def columns(self, spots: Tensor) -> Columns:
         """Sparse ∂H_r/∂albedo and ∂H_r/∂depth of every surfel at ``spots`` ``[B]``; memory 13 numbers per path."""

@@ -28,6 +28,9 @@ class Paths(NamedTuple):
     sensor_leg: Tensor  # [B, M, Q] m; the same tensor when confocal
     laser_cosine: Tensor  # [B, M, Q] at the surfel, towards the laser's wall point, ≥ 0
     sensor_cosine: Tensor  # [B, M, Q]
+    centre: Tensor  # [M, 3] m, of the surfels
+    normal: Tensor  # [M, 3]
+    area: Tensor  # [M] m²
 
 
 def quadrature(n: int, device: torch.device | str = "cpu") -> Tensor:
@@ -81,9 +84,10 @@ def trace(
     share = (area / len(offsets))[:, None]
     factor, leg, cosine = _leg(points, normal, laser, laser_normal)
     if confocal:
-        return Paths(share * factor**2, 2 * leg, leg, leg, cosine, cosine)
+        return Paths(share * factor**2, 2 * leg, leg, leg, cosine, cosine, centre, normal, area)
     other, other_leg, other_cosine = _leg(points, normal, sensor, sensor_normal)
-    return Paths(share * factor * other, leg + other_leg, leg, other_leg, cosine, other_cosine)
+    legs = (leg, other_leg, cosine, other_cosine)
+    return Paths(share * factor * other, leg + other_leg, *legs, centre, normal, area)
 
 
 def _leg(points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:

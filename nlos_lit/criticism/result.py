@@ -1,0 +1,134 @@
+"""What a diagnosis says, as frozen records; ``diagnosis.json`` is :meth:`Diagnosis.to_dict`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter with its standard error."""
+
+    value: float
+    stderr: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What an effect brings on spots it was not fitted to; ``ci95`` of ``nats_per_photon``, by block bootstrap."""
+
+    deviance_per_bin_before: float
+    deviance_per_bin_after: float
+    nats_per_photon: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """An effect that the model was extended with."""
+
+    name: str
+    parameters: dict[str, Estimate]
+    statistic: float
+    p_value: float
+    heldout_gain: Gain
+    confusable_with: list[str] = field(default_factory=list)
+    split_by: str = ""
+
+
+@dataclass(frozen=True)
+class Screened:
+    """One effect's score test at its null, against the base.
+
+    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters, ``shape`` the scanned ones;
+    ``detectable`` is the smallest amplitude of each parameter that this capture would reveal (statistic 25).
+    """
+
+    name: str
+    statistic: float
+    p_value: float
+    retained_information: float
+    degrees: int
+    predicted_gain: float
+    one_step: dict[str, float]
+    shape: dict[str, float]
+    detectable: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is still wrong after all accepted effects, and along which axis it shows."""
+
+    significant: bool
+    axis: str
+    statistic: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well a set of spots is explained; ``noise`` levels are what the truth would score."""
+
+    deviance_per_bin: float
+    deviance_noise: float
+    nmse: float
+    nmse_noise: float
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Signed residual significance along one axis, before and after the extension.
+
+    ``edges`` ``[K + 1]`` in ``unit``, ``before`` and ``after`` ``[K]`` (K1 × K2 for the wall, with ``edges`` of both sides).
+    """
+
+    axis: str
+    unit: str
+    edges: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    edges_y: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Everything that ``diagnose.py`` found."""
+
+    effects: list[Accepted]
+    groups: list[list[str]]
+    unexplained: Unexplained
+    screened: list[Screened]
+    base: Scores
+    extended: Scores
+    untouched_test: dict[str, Scores]  # "base", "extended"
+    witness: dict[str, Any] | None
+    profiles: list[Profile]
+    numerics: dict[str, float]
+    notes: list[str]
+    capture: dict[str, Any]
+    toys: int
+    seconds: float
+    seed: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-serialisable."""
+        return _plain(dataclasses.asdict(self))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not np.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,168 @@
+"""What every effect is: a module with declared parameters that acts at one or more stages of the forward model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nlos_lit.effects.scan import Scan
+from nlos_lit.surfels import Hooks
+
+STAGES = ("path", "time", "response", "spot", "counting")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of an effect.
+
+    Args:
+        unit: SI unit, ``1`` for pure numbers.
+        null: value at which the effect is absent; None for a shape (a delay, a decay) that means nothing at the null …
+        grid: … and is therefore scanned over these values.
+        scale: a noticeable change: stored values count in it.
+        lower, upper: bounds.
+        size: number of coefficients; they share null, scale and bounds.
+        log: shape that is stored as its logarithm (``scale`` is then a change of the logarithm).
+    """
+
+    name: str
+    unit: str
+    null: float | None
+    scale: float
+    lower: float
+    upper: float
+    size: int = 1
+    grid: tuple[float, ...] = ()
+    log: bool = False
+
+
+class Quantity(NamedTuple):
+    """A number worth reporting, differentiable by the effect's parameters."""
+
+    value: Tensor
+    unit: str
+
+
+class Effect(nn.Module, Hooks):
+    """One physical effect. Subclasses set ``name`` and ``stage``, declare parameters, and override the hooks they need.
+
+    Args:
+        scan: of the capture.
+
+    Attributes:
+        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole transients.
+        per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is what is reported.
+    """
+
+    name: ClassVar[str]
+    stage: ClassVar[str]
+    needs_paths: ClassVar[bool] = False
+    per_spot: ClassVar[bool] = False
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__()
+        self.scan = scan
+        self.declared = {p.name: p for p in self.declare(scan)}
+        for p in self.declared.values():
+            self.register_parameter(f"raw_{p.name}", nn.Parameter(torch.zeros(p.size)))
+        self.reset()
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        """Parameters, amplitudes before shapes."""
+        raise NotImplementedError
+
+    def value(self, name: str) -> Tensor:
+        """``[size]`` (a scalar for size 1) in the parameter's unit."""
+        p, raw = self.declared[name], getattr(self, f"raw_{name}")
+        value = torch.exp(p.scale * raw) if p.log else p.scale * raw
+        return value[0] if p.size == 1 else value
+
+    @torch.no_grad()
+    def set(self, name: str, value: float | Tensor) -> None:
+        """Store a value (or one for each coefficient), kept within the bounds."""
+        p = self.declared[name]
+        value = torch.as_tensor(value, dtype=torch.float32).clamp(p.lower, p.upper)
+        getattr(self, f"raw_{name}").copy_((torch.log(value) if p.log else value) / p.scale)
+
+    def reset(self) -> None:
+        """The null; shapes at the middle of their grids."""
+        for p in self.declared.values():
+            self.set(p.name, p.grid[len(p.grid) // 2] if p.null is None else p.null)
+
+    @torch.no_grad()
+    def clamp(self) -> None:
+        """Bring every parameter back within its bounds, after a step of an optimiser."""
+        for p in self.declared.values():
+            self.set(p.name, self.value(p.name))
+
+    @property
+    def amplitudes(self) -> list[Parameter]:
+        """Parameters with a null value."""
+        return [p for p in self.declared.values() if p.null is not None]
+
+    @property
+    def shapes(self) -> list[Parameter]:
+        """Parameters without one."""
+        return [p for p in self.declared.values() if p.null is None]
+
+    def shape_grid(self) -> list[dict[str, float]]:
+        """Combinations of shape values to scan; one empty combination where there are none."""
+        combinations: list[dict[str, float]] = [{}]
+        for p in self.shapes:
+            combinations = [{**c, p.name: v} for c in combinations for v in p.grid]
+        return combinations
+
+    def quantities(self) -> dict[str, Quantity]:
+        """What is reported: every scalar parameter; effects with coefficients override this."""
+        return {p.name: Quantity(self.value(p.name), p.unit) for p in self.declared.values() if p.size == 1}
+
+
+class Extension(nn.Module, Hooks):
+    """Several effects as one, each stage in the order given."""
+
+    def __init__(self, effects: list[Effect]) -> None:
+        super().__init__()
+        self.effects = nn.ModuleList(effects)
+
+    def path(self, contribution: Tensor, paths: Any, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            contribution = effect.path(contribution, paths, spots)
+        return contribution
+
+    def time(self, length: Tensor, paths: Any, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            length = effect.time(length, paths, spots)
+        return length
+
+    def transients(self, transients: Tensor, energy: Tensor, paths: Any, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            transients = effect.transients(transients, energy, paths, spots)
+        return transients
+
+    def response(self, kernel: Tensor, lead: int) -> Tensor:
+        for effect in self.effects:
+            kernel = effect.response(kernel, lead)
+        return kernel
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            signal = effect.gain(signal, spots)
+        return signal
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            background = effect.background(background, spots)
+        return background
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        for effect in self.effects:
+            expected = effect.counting(expected, spots)
+        return expected
+
+    def clamp(self) -> None:
+        for effect in self.effects:
+            effect.clamp()

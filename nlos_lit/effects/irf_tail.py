@@ -1,0 +1,47 @@
+"""Slow tail of the instrument response."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.scan import Scan
+
+
+class IrfTail(Effect):
+    """A share of the photons is counted late, by an exponentially distributed delay.
+
+    ``Ψ' = (1 - f) Ψ + f · Ψ * (e^{-t/τ}/τ)``
+
+    Parameters: ``fraction`` f (1), null 0. ``decay`` τ (m of path), scanned.
+
+    Signature: residuals above 0 for tens of bins after every strong return, at every spot alike; energy is conserved.
+
+    Degenerate with: ``afterpulsing`` (the same delay, after background counts too), weak surfels behind the surface.
+
+    Source: diffusion tail of silicon SPADs: carriers from the neutral region reach the junction late (S. Cova et al.,
+    *Avalanche photodiodes and quenching circuits for single-photon detection*, Appl. Opt. 35, 1996).
+    """
+
+    name = "irf_tail"
+    stage = "response"
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        bins = scan.bin_length
+        decays = tuple(bins * d for d in (4.0, 10.0, 25.0, 60.0, 150.0) if d < scan.n_bins / 1.5)
+        return (
+            Parameter("fraction", "1", 0.0, 0.05, 0.0, 0.9),
+            Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins, grid=decays, log=True),
+        )
+
+    def response(self, kernel: Tensor, lead: int) -> Tensor:
+        length = lead + self.scan.n_bins
+        kernel = torch.nn.functional.pad(kernel, (0, max(0, length - len(kernel))))[:length]
+        share = torch.arange(length + 1, dtype=kernel.dtype, device=kernel.device) * (self.scan.bin_length / self.value("decay"))
+        late = torch.exp(-share[:-1]) - torch.exp(-share[1:])
+        size = 2 * length
+        tail = torch.fft.irfft(torch.fft.rfft(kernel, size) * torch.fft.rfft(late, size), size)[:length]
+        fraction = self.value("fraction")
+        return (1 - fraction) * kernel + fraction * tail
