@@ -22,7 +22,7 @@ from nlos_lit.functional.surfel_paths import SPLINE_VARIANCE, gather_bins, quadr
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.laser_sensor import LaserSensor
 from nlos_lit.parameters import BoundedParameter
-from nlos_lit.surfels import Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels import NOTHING, Hooks, Lateral, SurfelModel, spline_sensor
 
 CHUNK = 1 << 21  # paths at a time
 EXACT = "donot_use_mm_for_euclid_dist"
@@ -126,12 +126,14 @@ def score(
     counts: Tensor,
     expected: Tensor,
     spots: Tensor,
+    hooks: Hooks = NOTHING,
 ) -> Score:
     """Test candidates on ``spots``.
 
     Args:
         cell: extents of a cell, m. points: quadrature points along each side.
         counts, expected: ``[B, T_gate]`` of ``spots`` ``[B]``.
+        hooks: whose response is applied.
     """
     sensor, bins = laser_sensor, capture.gate[1]
     device = counts.device
@@ -140,8 +142,9 @@ def score(
         full = torch.nn.functional.pad(image, (bins - image.shape[1], 0))
         return convolve_time(full, kernel.flip(0), len(kernel) - 1 - sensor.lead)
 
-    kernel = sensor.kernel()
+    kernel = hooks.response(sensor.kernel(), sensor.lead)
     whole = response(sensor.sigma_ls() / sensor.bin_length, sensor.kappa_s() * sensor.bin_length, sensor.length, sensor.lead)
+    whole = hooks.response(whole, sensor.lead)
     pull = adjoint(counts / expected - 1, kernel)
     weight = adjoint(1 / expected, whole**2).clamp_min(0)
     walls = [
@@ -223,6 +226,7 @@ def prune_and_grow(
     tested: Tensor,
     prune: float,
     grow: float,
+    hooks: Hooks = NOTHING,
 ) -> None:
     """Drop surfels that the counts do not need or that left the volume; add some where the counts ask for more light.
 
@@ -230,15 +234,16 @@ def prune_and_grow(
         reserve: unused seeds; candidates besides the places next to surfels.
         counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; ``tested`` are the rows that are looked at.
         prune, grow: significances, over all training spots.
+        hooks: effects of the present expectation; candidates are tested with their response.
     """
     spots, seen = train[tested], counts[tested]
-    expected = model.expected(spots)
+    expected = model.expected(spots, hooks)
     scale = len(train) / len(tested)
     low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
     sensor, cell = model.laser_sensor, tuple(model.cell.tolist())
 
     def test(places: Candidates, points: int) -> Score:
-        return score(places, capture, cell, points, sensor, seen, expected, spots)
+        return score(places, capture, cell, points, sensor, seen, expected, spots, hooks)
 
     present = Candidates(model.centre(), model.normal())
     albedo = model.albedo()

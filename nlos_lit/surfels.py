@@ -203,16 +203,26 @@ class SurfelModel(nn.Module):
 
     def transients(self, paths: Paths, spots: Tensor, hooks: Hooks) -> Tensor:
         """Stages 2 and 3: ``[B, T]`` light on arrival, H_r."""
-        energy, length = hooks.path(paths.contribution * self.albedo()[:, None], paths, spots), hooks.time(paths.length, paths, spots)
+        energy, length = (
+            hooks.path(paths.contribution * self.albedo()[:, None], paths, spots),
+            hooks.time(paths.length, paths, spots),
+        )
         transients = SplineSplat.apply(energy.flatten(1), self.arrival(length).flatten(1), self.n_bins)
         return hooks.transients(transients, energy, paths, spots)
 
-    def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
-        """Stage 4: ``[B, T]`` expected counts from ``[B, T]`` transients: response → gain → background → counting."""
+    def signal(self, transients: Tensor, hooks: Hooks) -> Tensor:
+        """Stage 4: ``[B, T]`` transients through the response, counts."""
         sensor = self.laser_sensor
-        kernel = hooks.response(sensor.kernel(), sensor.lead)
-        signal = hooks.gain(sensor.intensity() * convolve_time(transients, kernel, sensor.lead), spots)
-        return hooks.counting(signal + hooks.background(sensor.background(), spots), spots)
+        return sensor.intensity() * convolve_time(transients, hooks.response(sensor.kernel(), sensor.lead), sensor.lead)
+
+    def detect(self, signal: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stage 5: ``[B, T]`` expected counts: gain → background → counting."""
+        background = hooks.background(self.laser_sensor.background(), spots)
+        return hooks.counting(hooks.gain(signal, spots) + background, spots)
+
+    def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stages 4 and 5."""
+        return self.detect(self.signal(transients, hooks), spots, hooks)
 
     def render(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
         """``[B, T_gate]`` expected counts of ``spots`` ``[B]``."""

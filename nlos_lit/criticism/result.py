@@ -45,8 +45,8 @@ class Accepted:
 class Screened:
     """One effect's score test at its null, against the base.
 
-    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters, ``shape`` the scanned ones;
-    ``detectable`` is the smallest amplitude of each parameter that this capture would reveal (statistic 25).
+    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters, ``shape`` the
+    scanned ones; ``detectable`` is the smallest amplitude of each parameter that this capture would reveal (statistic 25).
     """
 
     name: str
