@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.delays import convolve, whole_record
 from nlos_lit.effects.scan import Scan
 
 
@@ -37,11 +38,9 @@ class IrfTail(Effect):
         )
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:
-        length = lead + self.scan.n_bins
-        kernel = torch.nn.functional.pad(kernel, (0, max(0, length - len(kernel))))[:length]
-        share = torch.arange(length + 1, dtype=kernel.dtype, device=kernel.device) * (self.scan.bin_length / self.value("decay"))
+        kernel = whole_record(kernel, lead, self.scan.n_bins)
+        steps = torch.arange(len(kernel) + 1, dtype=kernel.dtype, device=kernel.device)
+        share = steps * (self.scan.bin_length / self.value("decay"))
         late = torch.exp(-share[:-1]) - torch.exp(-share[1:])
-        size = 2 * length
-        tail = torch.fft.irfft(torch.fft.rfft(kernel, size) * torch.fft.rfft(late, size), size)[:length]
         fraction = self.value("fraction")
-        return (1 - fraction) * kernel + fraction * tail
+        return (1 - fraction) * kernel + fraction * convolve(kernel, late)

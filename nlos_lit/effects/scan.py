@@ -42,11 +42,25 @@ class Scan:
     def n_spots(self) -> int:
         return len(self.rank)
 
+    @property
+    def centre(self) -> Tensor:
+        """``[2]`` centre of the scanned wall, m."""
+        fixed_laser = bool((self.laser == self.laser[0]).all())
+        moving = self.sensor if fixed_laser else self.laser
+        return moving[0, :2] - self.half * self.places[0][0]
+
+    @property
+    def middle(self) -> float:
+        """Path length at the middle of the gate, m."""
+        return self.t_start + (self.gate[0] + self.gate[1]) / 2 * self.bin_length
+
     @staticmethod
     def of(capture: Capture) -> Scan:
         """The scan of a capture."""
         laser, sensor = (torch.tensor(getattr(capture, n), dtype=torch.float32) for n in ("laser", "sensor"))
-        moving = [laser] if capture.confocal else [p for p in (laser, sensor) if float(np.ptp(p.numpy(), axis=0).max()) > 0]
+        moving = (
+            [laser] if capture.confocal else [p for p in (laser, sensor) if float(np.ptp(p.numpy(), axis=0).max()) > 0] or [laser]
+        )
         low = torch.stack([p[:, :2].amin(0) for p in moving]).amin(0)
         high = torch.stack([p[:, :2].amax(0) for p in moving]).amax(0)
         half = float((high - low).max()) / 2 or 1.0

@@ -1,0 +1,45 @@
+"""Counts that cause later counts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.delays import convolve, geometric
+from nlos_lit.effects.scan import Scan
+
+
+class Afterpulsing(Effect):
+    """Carriers trapped during an avalanche are released later and count again.
+
+    ``m'_t = m_t + probability · Σ_{s<t} m_s p_{t-s}``, ``p_k ∝ e^{-k/τ}``, ``Σ_k p_k = 1``; only counts of this record matter.
+
+    Parameters: ``probability`` (1), null 0. ``decay`` τ (m of path), scanned.
+
+    Signature: excess behind every strong return, as with ``irf_tail``, and energy is gained; the background rises along the record.
+
+    Degenerate with: ``irf_tail`` (the same decay, but energy is kept and the background stays flat).
+
+    Source: S. Cova, A. Lacaita, G. Ripamonti, *Trapping phenomena in avalanche photodiodes on nanosecond scale*, IEEE Electron
+    Device Lett. 12, 1991.
+    """
+
+    name = "afterpulsing"
+    stage = "counting"
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        bins = scan.bin_length
+        decays = geometric(4 * bins, 0.75 * bins * scan.n_bins, 7)
+        return (
+            Parameter("probability", "1", 0.0, 0.05, 0.0, 0.9),
+            Parameter("decay", "m", None, 0.2, bins, 4 * bins * scan.n_bins, grid=decays, log=True),
+        )
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        rate = self.scan.bin_length / self.value("decay")
+        later = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
+        # Never in the same bin; the sum over all later bins is 1.
+        kernel = torch.where(later > 0, torch.expm1(rate) * torch.exp(-later * rate), 0.0)
+        return expected + self.value("probability") * convolve(expected, kernel)

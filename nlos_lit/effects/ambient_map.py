@@ -1,0 +1,41 @@
+"""Ambient light that is not the same all over the wall."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.effects.smooth import SmoothEffect, over_wall
+
+
+class AmbientMap(SmoothEffect):
+    """The constant background varies smoothly over the wall, as with a lamp on one side.
+
+    ``background → background · e^{f(x, y)}``, f a 5×5 tensor product of cubic splines without its constant; of both points,
+    added, where both laser and sensor move.
+
+    Parameters: ``level_map`` (1, logarithm), at most 24 coefficients, null 0. Quantity ``rms`` (1) of the logarithm.
+
+    Signature: the level before the first return forms a smooth map over the wall.
+
+    Degenerate with: nothing where the gate holds bins without scene; else ``irf_tail`` with ``wall_reflectance``.
+
+    Source: splines: C. de Boor, *A Practical Guide to Splines*, 1978.
+    """
+
+    name = "ambient_map"
+    stage = "spot"
+    coefficients = "level_map"
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 5)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("level_map", "1", 0.0, 0.1, -1.5, 1.5, size=cls.basis(scan).shape[1]),)
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        return background * torch.exp(self.field(spots))[:, None]

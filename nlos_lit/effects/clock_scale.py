@@ -1,0 +1,35 @@
+"""Time bins that are not as wide as the file says."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.functional.surfel_paths import Paths
+
+
+class ClockScale(Effect):
+    """The recorded time axis is stretched about the middle of the gate.
+
+    ``L → L0 + (1 + scale)(L - L0)``, L0 the path length at the middle of the gate.
+
+    Parameters: ``scale`` (1), null 0.
+
+    Signature: early returns too early and late ones too late, or the reverse, the more so the farther from the gate's middle.
+
+    Degenerate with: the scene's depth and curvature, ``time_offset``; a deep scene splits them.
+
+    Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (calibration of the time axis).
+    """
+
+    name = "clock_scale"
+    stage = "time"
+    needs_paths = True
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("scale", "1", 0.0, 0.01, -0.3, 0.3),)
+
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        return length + self.value("scale") * (length - self.scan.middle)

@@ -1,0 +1,43 @@
+"""What is left of the direct pulse inside the gate."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.delays import geometric
+from nlos_lit.effects.scan import Scan
+
+
+class DirectLeak(Effect):
+    """The tail of the first bounce reaches into the gate, the same at every spot.
+
+    ``background → background + amplitude e^{-(t - first)/τ}``, t the bin number, first that of the gate; constant before the gate.
+
+    Parameters: ``amplitude`` (counts/bin, in the gate's first bin), null 0. ``decay`` τ (m of path), scanned.
+
+    Signature: residual above 0 at the start of the gate, equal at all spots however far the scene is from them.
+
+    Degenerate with: ``background_slope`` for long decays, ``gate_edges`` (which is proportional to what is there).
+
+    Source: gating against the direct pulse: M. Buttafava et al., *Non-line-of-sight imaging using a time-gated single photon
+    avalanche diode*, Opt. Express 23, 2015.
+    """
+
+    name = "direct_leak"
+    stage = "spot"
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        bins, width = scan.bin_length, scan.gate[1] - scan.gate[0]
+        most = 1e3 * (scan.mean_counts / scan.n_bins + scan.background)
+        return (
+            Parameter("amplitude", "counts/bin", 0.0, scan.background, 0.0, most),
+            Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins * 2, grid=geometric(3 * bins, bins * width, 8), log=True),
+        )
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        first, last = self.scan.gate
+        since = (torch.arange(last, dtype=background.dtype, device=background.device) - first).clamp_min(0)
+        return background + self.value("amplitude") * torch.exp(-since * self.scan.bin_length / self.value("decay"))

@@ -1,0 +1,54 @@
+"""Sensor that looks beside the point that it is thought to look at."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.functional.surfel_paths import Paths
+
+
+class LaserSensorBaseline(Effect):
+    """The sensor looks at ``sensor + (baseline_x, baseline_y, 0)``; the laser hits its stated point.
+
+    ``d2 → |p - s - b|`` in length and throughput (d2⁻², both cosines), worked out at the surfels' centres.
+
+    Parameters: ``baseline_x``, ``baseline_y`` (m), null 0.
+
+    Signature: edges in time shifted by ``-b·(p - s)/d2``: one sign for scene on one side of a spot, the other for the other side.
+
+    Degenerate with: a sideways shift of the scene by half the baseline, exactly so for confocal scans of far scenes; ``wall_tilt``.
+
+    Source: geometry.
+    """
+
+    name = "laser_sensor_baseline"
+    stage = "time"
+    needs_paths = True
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.register_buffer("sensor", scan.sensor.clone(), persistent=False)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        reach = 0.25 * scan.half
+        return tuple(Parameter(name, "m", 0.0, scan.bin_length, -reach, reach) for name in ("baseline_x", "baseline_y"))
+
+    def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        stated, real = self.legs(paths, spots)
+        facing = [(-(leg * paths.normal).sum(2)).clamp_min(1e-6) for leg in (stated, real)]
+        squares = [leg.square().sum(2) for leg in (stated, real)]
+        return contribution * (facing[1] / facing[0] * (squares[0] / squares[1]) ** 2)[..., None]
+
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        stated, real = self.legs(paths, spots)
+        return length + (real.norm(dim=2) - stated.norm(dim=2))[..., None]
+
+    def legs(self, paths: Paths, spots: Tensor) -> tuple[Tensor, Tensor]:
+        """``[B, M, 3]`` from the sensor's stated and its real point to the surfels' centres."""
+        stated = paths.centre - self.sensor[spots][:, None]
+        x, y = self.value("baseline_x"), self.value("baseline_y")
+        return stated, stated - torch.stack([x, y, torch.zeros_like(x)])

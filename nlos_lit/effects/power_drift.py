@@ -1,0 +1,44 @@
+"""Laser power that wanders while the wall is scanned."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.effects.smooth import SmoothEffect, over_time
+
+
+class PowerDrift(SmoothEffect):
+    """The laser gets stronger or weaker, or the detector's efficiency drifts.
+
+    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its constant.
+
+    Parameters: ``drift`` (1, logarithm of the gain), 5 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (1).
+
+    Signature: spot totals follow the order of acquisition; the shape in time is right.
+
+    Degenerate with: ``wall_reflectance`` in a raster scan, which can be any smooth function of the slow axis; normals of a small
+    scene.
+
+    Source: none needed, a smooth gain.
+    """
+
+    name = "power_drift"
+    stage = "spot"
+    coefficients = "drift"
+    ends: ClassVar[bool] = True
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_time(scan)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("drift", "1", 0.0, 0.05, -1.5, 1.5, size=cls.basis(scan).shape[1]),)
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        return signal * torch.exp(self.field(spots))[:, None]

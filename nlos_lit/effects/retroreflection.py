@@ -1,0 +1,42 @@
+"""Scene that sends light back to where it came from."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.functional.surfel_paths import Paths
+
+
+class Retroreflection(Effect):
+    """Brightness falls more slowly with distance, and depends less on the surface's tilt, than that of diffuse surfaces.
+
+    ``d1⁻² d2⁻² cosθ2 cosθ3 → (d1 d2)^{-falloff/2} d0^{falloff-4} (cosθ2 cosθ3)^cosine``, d0 half the path at the middle of the
+    gate.
+
+    Parameters: ``falloff`` (1), null 4; 2 for a confocal retroreflector. ``cosine`` (1), null 1; 0 for one.
+
+    Signature: with a large wall, a smooth map over wall positions and depths: far spots are too bright.
+
+    Degenerate with: ``vignetting`` and ``wall_reflectance`` when the scene is shallow (one distance per spot), ``specular_lobe``.
+
+    Source: M. O'Toole, D. B. Lindell, G. Wetzstein, *Confocal non-line-of-sight imaging based on the light-cone transform*, Nature
+    555, 2018: r⁻⁴ for diffuse, r⁻² for retroreflective scenes.
+    """
+
+    name = "retroreflection"
+    stage = "path"
+    needs_paths = True
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("falloff", "1", 4.0, 0.2, 1.0, 6.0), Parameter("cosine", "1", 1.0, 0.2, -0.5, 3.0))
+
+    def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        distance = paths.laser_leg * paths.sensor_leg / (self.scan.middle / 2) ** 2
+        # Grazing surfels carry no light; the clamp keeps a power below 0 finite for them.
+        cosines = (paths.laser_cosine * paths.sensor_cosine).clamp_min(1e-6)
+        exponent = (4 - self.value("falloff")) / 2
+        return contribution * torch.exp(exponent * torch.log(distance) + (self.value("cosine") - 1) * torch.log(cosines))

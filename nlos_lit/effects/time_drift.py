@@ -1,0 +1,45 @@
+"""Time axis that wanders while the wall is scanned."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from torch import Tensor
+
+from nlos_lit.effects.base import Parameter
+from nlos_lit.effects.scan import Scan
+from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.functional.surfel_paths import Paths
+
+
+class TimeDrift(SmoothEffect):
+    """The delay between laser and detector drifts, as with temperature.
+
+    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its constant.
+
+    Parameters: ``drift`` (m of path), 5 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (m).
+
+    Signature: residuals of both signs at every edge in time, their sign changing along the scan.
+
+    Degenerate with: ``wall_tilt`` in a raster scan (slow axis = scan order); a serpentine scan or columns split nothing more.
+
+    Source: W. Becker, *The bh TCSPC Handbook* (timing drift of detector and trigger).
+    """
+
+    name = "time_drift"
+    stage = "time"
+    needs_paths = True
+    coefficients = "drift"
+    ends: ClassVar[bool] = True
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_time(scan)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        reach = 0.1 * scan.n_bins * scan.bin_length
+        return (Parameter("drift", "m", 0.0, scan.bin_length, -reach, reach, size=cls.basis(scan).shape[1]),)
+
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        return length + self.field(spots)[:, None, None]

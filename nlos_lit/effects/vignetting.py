@@ -1,0 +1,39 @@
+"""Optics that lose light away from their axis."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.base import Effect, Parameter
+from nlos_lit.effects.scan import Scan
+
+
+class Vignetting(Effect):
+    """Spots away from the middle of the scanned wall are darker (or, with the other sign, brighter).
+
+    ``signal → signal · e^{-strength |x|²}``, x the spot's place in [-1, 1]²; |x|² of laser and sensor added where both move.
+
+    Parameters: ``strength`` (1), null 0, of either sign.
+
+    Signature: spot totals fall off radially from the wall's centre; the shape in time is right.
+
+    Degenerate with: ``wall_reflectance`` (any smooth map), ``retroreflection`` of a shallow scene before the wall's centre,
+    normals.
+
+    Source: to second order the cos⁴ law of lenses: B. K. P. Horn, *Robot Vision*, 1986, ch. 10.
+    """
+
+    name = "vignetting"
+    stage = "spot"
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.register_buffer("square", sum(place.square().sum(1) for place in scan.places), persistent=False)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("strength", "1", 0.0, 0.05, -2.0, 2.0),)
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        return signal * torch.exp(-self.value("strength") * self.square[spots])[:, None]
