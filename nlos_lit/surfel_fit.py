@@ -123,10 +123,11 @@ class SurfelFit:
         return self.order[self.place - size : self.place]
 
     def run(
-        self, rounds: int, progress: Progress | None = None, grow_first: bool = False, steps: int | None = None
+        self, rounds: int, progress: Progress | None = None, grow_first: bool = False, steps: int | None = None, settle: bool = True
     ) -> list[dict[str, float]]:
         """``rounds`` rounds of ``steps`` batches (default: the settings'), the last twice as long; surfels die and grow between them.
 
+        ``settle``: the first round comes from seeds, and the response waits for their places.
         Returns one entry a round: surfels, mean loss over its last quarter, response.
         """
         s, history, done = self.settings, [], 0
@@ -139,7 +140,7 @@ class SurfelFit:
             if s.visibility:
                 self.model.update_visibility()
             losses = []
-            for loss in self._round(rounds - 1 - index, index == 0 and not grow_first, steps):
+            for loss in self._round(rounds - 1 - index, index == 0 and settle, steps):
                 losses.append(loss)
                 done += 1
                 if progress is not None:

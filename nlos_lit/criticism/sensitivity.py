@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.basis import smooth_map_basis
-from nlos_lit.functional.surfel_paths import Paths, quadrature, spline_slopes, spline_weights, trace
+from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels import SurfelModel
 
 TILT_PRIOR = 0.1  # rad: how far normals may lean together, away from the surface's own slope
@@ -52,16 +52,24 @@ class Problem:
         return self.expected.shape[1]
 
 
-def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor) -> Problem:
-    """Nuisance columns and residual of ``spots`` ``[S]`` with gated counts ``[S, T_gate]``."""
+def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor, with_effects: bool = True) -> Problem:
+    """Nuisance columns and residual of ``spots`` ``[S]`` with gated counts ``[S, T_gate]``.
+
+    ``with_effects``: parameters of the extension's effects are nuisance, too.
+    """
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
-    bins, m = expected.shape[1], len(model)
+    m = len(model)
     tilts = _tilt_fields(model)
     size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
     surfels, others = [], []
     response = {f"model.laser_sensor.{n}": p for n, p in model.laser_sensor.named_parameters()}
-    accepted = {f"extension.{n}": p for n, p in extension.named_parameters() if p.numel() < len(model.laser)}
+    accepted = {
+        f"extension.effects.{i}.{n}": p
+        for i, e in enumerate(extension.effects)
+        for n, p in e.named_parameters()
+        if with_effects and not e.per_spot
+    }
     for part in spots.split(size):
         jacobian = _record_jacobian(model, extension, part)
         columns = _transient_columns(model, extension, part, tilts)
@@ -82,16 +90,19 @@ def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, count
     return Problem(model, extension, spots, counts, expected, nuisance, prior, residual)
 
 
-def effect_columns(problem: Problem, effect: Effect) -> Tensor:
-    """``[S·bins, k]`` weighted ∂μ/∂(stored amplitudes) of an effect at its present values, after the accepted ones."""
-    model, first = problem.model, problem.model.gate[0]
-    order = [*problem.extension.effects, effect]
-    extension = Extension(sorted(order, key=stage_order))
-    index = next(i for i, e in enumerate(extension.effects) if e is effect)
-    names = [(f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in effect.amplitudes]
+def effect_columns(model: SurfelModel, extension: Extension, spots: Tensor, effect: Effect, shapes: bool = False) -> Tensor:
+    """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the extension.
+
+    ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every spot's own.
+    """
+    first, present = model.gate[0], list(extension.effects)
+    whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=stage_order))
+    index = list(whole.effects).index(effect)
+    wanted = effect.amplitudes + (effect.shapes if shapes else [])
+    names = [(f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted]
     parts = []
-    for part in problem.spots.split(_path_batch(model) if effect.needs_paths else 256):
-        forward = _staged(model, extension, effect, part)
+    for part in spots.split(_path_batch(model) if effect.needs_paths else 256):
+        forward = _staged(model, whole, effect, part)
         columns = []
         for name, raw, number in names:
             for k in range(1 if effect.per_spot else number):
@@ -99,7 +110,13 @@ def effect_columns(problem: Problem, effect: Effect) -> Tensor:
                 tangent[k] = 1.0
                 columns.append(_jvp(forward, name, raw, tangent))
         parts.append(torch.stack(columns, -1)[:, first:].flatten(0, 1))
-    return torch.cat(parts) * problem.expected.reshape(-1, 1).rsqrt()
+    return torch.cat(parts)
+
+
+def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
+    """:func:`effect_columns` of a problem's spots, divided by √μ."""
+    columns = effect_columns(problem.model, problem.extension, problem.spots, effect, shapes)
+    return columns * problem.expected.reshape(-1, 1).rsqrt()
 
 
 STAGE_ORDER = ("path", "time", "response", "spot", "counting")

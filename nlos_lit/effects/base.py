@@ -68,6 +68,7 @@ class Effect(nn.Module, Hooks):
         self.declared = {p.name: p for p in self.declare(scan)}
         for p in self.declared.values():
             self.register_parameter(f"raw_{p.name}", nn.Parameter(torch.zeros(p.size)))
+        self.width, self.share = 0.0, 1.0  # per-spot effects: of their distribution, and how many spots have it
         self.reset()
 
     @classmethod

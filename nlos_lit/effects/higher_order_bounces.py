@@ -45,13 +45,12 @@ class HigherOrderBounces(Effect):
     name = "higher_order_bounces"
     stage = "path"
     needs_paths = True
-    ratio: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
         self.register_buffer("laser", scan.laser.clone(), persistent=False)
         self.register_buffer("sensor", scan.sensor.clone(), persistent=False)
-        self.register_buffer("ratio", torch.tensor(math.nan))
+        self.ratio = math.nan
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
@@ -60,14 +59,14 @@ class HigherOrderBounces(Effect):
     def quantities(self) -> dict[str, Quantity]:
         strength = self.value("strength")
         reported = {"strength": Quantity(strength, "1")}
-        if not torch.isnan(self.ratio):
+        if not math.isnan(self.ratio):
             reported["share"] = Quantity(strength * self.ratio, "1")
         return reported
 
     def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         fourth = self.fourth_bounce(energy, paths, spots, transients.shape[1])
         if not torch.is_grad_enabled():
-            self.ratio.fill_(float(fourth.sum()) / max(float(energy.sum()), 1e-30))
+            self.ratio = float(fourth.sum()) / max(float(energy.sum()), 1e-30)
         return transients + self.value("strength") * fourth
 
     def fourth_bounce(self, energy: Tensor, paths: Paths, spots: Tensor, n_bins: int) -> Tensor:

@@ -1,0 +1,79 @@
+"""Parameters of accepted effects with their uncertainties, from the curvature of the whole fit."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.criticism.result import Estimate
+from nlos_lit.criticism.screen import Projector
+from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
+from nlos_lit.effects.base import Effect
+from nlos_lit.surfel_fit import SurfelFit
+
+
+class Uncertainty:
+    """Joint covariance of all parameters of all effects, the base projected off.
+
+    The larger of two: F⁻¹ (counts alone) and F⁻¹(Σ_b s_b s_bᵀ)F⁻¹ (scatter of the score between wall blocks, which also feels
+    misfit; Huber's sandwich).
+    """
+
+    def __init__(self, fit: SurfelFit, spots: Tensor, counts: Tensor, block: Tensor) -> None:
+        self.effects = [e for e in fit.extension.effects if not e.per_spot]
+        if not self.effects:
+            return
+        problem = build_problem(fit.model, fit.extension, spots, counts, with_effects=False)
+        projector = Projector(problem)
+        z = projector.off(torch.cat([weighted_columns(problem, e, shapes=True) for e in self.effects], 1))
+        information = (z.T @ z).double()
+        floor = 1e-9 * information.diagonal().mean() * torch.eye(len(information), dtype=torch.float64)
+        inverse = torch.linalg.inv(information + floor)
+        by_spot = (z * projector.residual[:, None]).view(len(spots), -1, z.shape[1]).sum(1).double()
+        names, index = torch.unique(block, return_inverse=True)
+        by_block = torch.zeros(len(names), z.shape[1], dtype=torch.float64).index_add_(0, index, by_spot)
+        self.step = inverse @ by_spot.sum(0)
+        robust = inverse @ (by_block.T @ by_block) @ inverse
+        grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
+        self.covariance = inverse * grow[:, None] * grow[None, :]
+
+    def parameters(self, effect: Effect) -> dict[str, Estimate]:
+        """Reported quantities; errors by the delta method. The width of per-spot effects: from the number of spots."""
+        if effect.per_spot:
+            return _spread(effect)
+        offset = sum(e_size(e) for e in self.effects[: self.effects.index(effect)])
+        raws = [getattr(effect, f"raw_{p.name}") for p in [*effect.amplitudes, *effect.shapes]]
+        own = self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)]
+        found = {}
+        for name, quantity in effect.quantities().items():
+            grads = torch.autograd.grad(quantity.value, raws, allow_unused=True, retain_graph=True)
+            slope = torch.cat([torch.zeros_like(r) if g is None else g for g, r in zip(grads, raws, strict=True)]).double()
+            variance = float(slope @ own @ slope)
+            found[name] = Estimate(float(quantity.value.detach()), max(variance, 0.0) ** 0.5, quantity.unit)
+        return found
+
+
+def e_size(effect: Effect) -> int:
+    """Number of an effect's stored values."""
+    return sum(p.size for p in effect.declared.values())
+
+
+def _spread(effect: Effect) -> dict[str, Estimate]:
+    fitted = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
+    return {
+        name: Estimate(float(q.value.detach()), float(q.value.detach()) / (2 * fitted) ** 0.5, q.unit)
+        for name, q in effect.quantities().items()
+    }
+
+
+def polish(fit: SurfelFit, uncertainty: Uncertainty, most: float = 3.0) -> None:
+    """One Newton step of the effects' parameters, each at most ``most`` standard errors: takes out what the optimiser left."""
+    start = 0
+    for effect in uncertainty.effects:
+        for p in [*effect.amplitudes, *effect.shapes]:
+            part = slice(start, start + p.size)
+            limit = most * uncertainty.covariance.diagonal()[part].sqrt()
+            with torch.no_grad():
+                getattr(effect, f"raw_{p.name}").add_(uncertainty.step[part].clamp(-limit, limit).float())
+            start += p.size
+        effect.clamp()
