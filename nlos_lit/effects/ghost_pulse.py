@@ -42,7 +42,7 @@ class GhostPulse(Effect):
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
         delay = self.value("delay") / self.scan.bin_length
-        whole = int(delay)
+        whole = int(delay.detach())
         part = delay - whole
         late, later = (torch.nn.functional.pad(kernel, (n, 0))[: len(kernel)] for n in (whole, whole + 1))
         return kernel + self.value("fraction") * ((1 - part) * late + part * later)

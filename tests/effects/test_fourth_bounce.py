@@ -1,0 +1,138 @@
+"""The fourth bounce against a sum over all pairs of surfels, written out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+from effect_contract import scene, surfels
+
+from nlos_lit.capture import Capture
+from nlos_lit.effects import Extension, Scan
+from nlos_lit.effects.higher_order_bounces import CLUSTERS, HigherOrderBounces, clusters
+from nlos_lit.surfels import SurfelModel
+
+BIN, T_START, N_BINS = 0.01, 0.5, 400
+
+
+def valley(confocal: bool, per_side: int = 8, opening: float = 1.0) -> tuple[Capture, SurfelModel]:
+    """Two plates that meet in a valley (a ridge for a negative opening), one of them darker, over a 5 × 3 scan."""
+    xy = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.3, 3), indexing="ij"), -1).reshape(-1, 2)
+    laser = np.column_stack([xy, np.zeros(15)])
+    sensor = laser if confocal else laser[::-1] * [0.5, 0.7, 0] + [0.05, 0.0, 0.0]
+    up = np.broadcast_to([0.0, 0.0, 1.0], (15, 3))
+    scene = Capture(np.ones((15, N_BINS), dtype=np.uint16), laser, sensor, up, up, bin_length=BIN, t_start=T_START)
+    line = (np.arange(2 * per_side) + 0.5) / per_side - 1
+    x, y = (g.ravel() * 0.3 for g in np.meshgrid(line, line, indexing="ij"))
+    centre = np.column_stack([x, y, 0.8 - opening * np.abs(x)])
+    normal = np.column_stack([-opening * np.sign(x), 0 * x, -np.ones_like(x)]) / math.hypot(1, opening)
+    base = surfels(dataclasses.replace(scene, gate=(0, N_BINS)))
+    base.cell = torch.tensor([0.3 / per_side] * 2)
+    base.place(*(torch.tensor(a, dtype=torch.float32) for a in (centre, normal, np.where(x > 0, 0.4, 1.0))))
+    return scene, base
+
+
+def all_pairs(capture: Capture, model: SurfelModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Energy, mean arrival (m) and its standard deviation for each spot, from ρ_a ρ_b/π · form factors, in numpy."""
+    centre, normal, albedo = (t.detach().double().numpy() for t in (model.centre(), model.normal(), model.albedo()))
+    area = float(model.cell.prod()) / -normal[:, 2]
+    gap = centre[None] - centre[:, None]
+    d = np.linalg.norm(gap, axis=2) + np.eye(len(d_ := centre))
+    leaving = np.maximum(np.einsum("abk,ak->ab", gap, normal), 0) / d
+    arriving = np.maximum(-np.einsum("abk,bk->ab", gap, normal), 0) / d
+    exchange = leaving * arriving / (d**2 + area.mean() / math.pi)
+    assert len(d_) == len(area)
+    sums = []
+    for l, s in zip(capture.laser, capture.sensor, strict=True):
+        legs = []
+        for wall in (l, s):
+            away = centre - wall
+            distance = np.linalg.norm(away, axis=1)
+            facing = np.maximum(-(away * normal).sum(1), 0) / distance
+            legs.append((distance, away[:, 2] / distance * facing / distance**2))
+        (dl, fl), (ds, fs) = legs
+        energy = np.outer(albedo * area * fl, albedo * area * fs) * exchange / math.pi
+        length = dl[:, None] + d + ds[None]
+        mean = (energy * length).sum() / energy.sum()
+        sums.append((energy.sum(), mean, math.sqrt((energy * (length - mean) ** 2).sum() / energy.sum())))
+    return tuple(np.array(sums).T)
+
+
+def fourth(capture: Capture, model: SurfelModel) -> np.ndarray:
+    effect, spots = HigherOrderBounces(Scan.of(capture)), torch.arange(capture.n_spots)
+    with torch.no_grad():
+        paths = model.paths(spots)
+        energy = paths.contribution * model.albedo()[:, None]
+        return effect.fourth_bounce(energy, paths, spots, N_BINS).double().numpy()
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize("per_side", [4, 8, 14])
+def test_energy_and_arrival_are_those_of_all_pairs(confocal, per_side):
+    capture, model = valley(confocal, per_side)
+    energy, mean, width = all_pairs(capture, model)
+    ours = fourth(capture, model)
+    time = T_START + (np.arange(N_BINS) + 0.5) * BIN
+    total = ours.sum(1)
+    our_mean = ours @ time / total
+    our_width = np.sqrt(((time - our_mean[:, None]) ** 2 * ours).sum(1) / total)
+    print(total/energy, our_mean-mean, our_width/width)
+    assert total == pytest.approx(energy, rel=0.05)
+    assert our_mean == pytest.approx(mean, abs=BIN)
+    assert our_width == pytest.approx(width, rel=0.1)
+
+
+def test_two_surfels_by_hand():
+    """Surfels at (±0.4, 0, 0.8), turned by 45° towards each other: both cosines between them are √½, d = 0.8."""
+    capture, model = valley(True)
+    capture = dataclasses.replace(capture, **{n: getattr(capture, n)[:1] * [0, 0, 1] for n in ("laser", "sensor")}, counts=capture.counts[:1], scan_order=None,
+        laser_normal=capture.laser_normal[:1], sensor_normal=capture.sensor_normal[:1])
+    model.laser, model.sensor = torch.zeros(1, 3), torch.zeros(1, 3)
+    half = math.sqrt(0.5)
+    model.quadrature = 1
+    model.cell = torch.tensor([0.01, 0.01])
+    model.place(torch.tensor([[-0.4, 0, 0.8], [0.4, 0, 0.8]]), torch.tensor([[half, 0, -half], [-half, 0, -half]]), torch.tensor([0.5, 0.8]))
+    ours = fourth(capture, model)[0]
+    # Legs √0.8; cosθ_wall = 0.8/√0.8, cosθ_surfel = (0.4 + 0.8) √½/√0.8; area 10⁻⁴ √2.
+    area, leg = 1e-4 * math.sqrt(2), math.sqrt(0.8)
+    into = area * (0.8 / leg) * (1.2 * half / leg) / 0.8
+    expected = 2 * 0.5 * 0.8 * into**2 * 0.5 / (0.64 + area / math.pi) / math.pi
+    assert ours.sum() == pytest.approx(expected, rel=1e-3)
+    arrival = ((np.arange(N_BINS) + 0.5) * ours).sum() / ours.sum()
+    assert arrival == pytest.approx((2 * leg + 0.8 - T_START) / BIN, abs=0.02)
+
+
+def test_flat_and_convex_surfaces_have_no_fourth_bounce():
+    for opening in (0.0, -0.8):
+        capture, model = valley(True, opening=opening)
+        assert np.abs(fourth(capture, model)).max() < 1e-12
+
+
+def test_clusters_are_few_and_whole():
+    generator = torch.Generator().manual_seed(2)
+    for m in (1, 12, 3000):
+        centre = torch.rand(m, 3, generator=generator) * torch.tensor([2.0, 1.0, 0.3])
+        member, cell = clusters(centre)
+        assert member.sum(1).tolist() == [1] * m
+        assert (member.sum(0) > 0).all()
+        assert member.shape[1] <= CLUSTERS
+        # No cluster is wider than its cube, and cubes are no larger than needed.
+        for k in range(member.shape[1]):
+            inside = centre[member[:, k] > 0]
+            assert (inside.amax(0) - inside.amin(0)).max() <= cell + 1e-5
+    assert member.shape[1] > CLUSTERS / 3
+
+
+def test_share_is_known_after_a_rendering():
+    model, scan = scene("confocal")
+    bounces, spots = HigherOrderBounces(scan), torch.arange(10)
+    bounces.set("strength", 2.0)
+    assert set(bounces.quantities()) == {"strength"}
+    plain, more = (model.expected(spots, Extension(e)) - 0.4 for e in ([], [bounces]))
+    share = bounces.quantities()["share"].value.item()
+    # All light of this scene falls into the record, but for the tail of the response.
+    assert (more.sum() / plain.sum() - 1).item() == pytest.approx(share, rel=0.1)
+    assert share > 1e-4
