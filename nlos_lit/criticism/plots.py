@@ -9,10 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from nlos_lit.criticism.quantities import number, percent, plus_minus, scales
 from nlos_lit.criticism.result import Accepted, Diagnosis, Profile, Screened
-from nlos_lit.criticism.verdict import could_not_be_seen
+from nlos_lit.criticism.verdict import barely, invisible
 from nlos_lit.criticism.words import describe
 from nlos_lit.figures import BLACK, BLUE, GREEN, NOTHING, ORANGE, RED, SIGNED, SKY, _bar, _upper_time_axis, styled
 
@@ -51,8 +52,7 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
 @styled
 def residual_profile(profile: Profile, bin_length: float | None = None) -> Figure:
     """Signed significance along an axis, before above after, on one scale; red beyond ±3σ. One panel where nothing changed."""
-    same = np.array_equal(profile.before, profile.after, equal_nan=True)
-    panels = {"": profile.before} if same else {"before": profile.before, "after": profile.after}
+    panels = _panels(profile)
     figure = Figure(figsize=(7.5, 0.9 + 1.9 * len(panels)))
     every = np.abs(np.concatenate([profile.before, profile.after]))
     limit = 1.15 * max(4.0, float(np.max(every[np.isfinite(every)], initial=0.0)))
@@ -71,7 +71,7 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
             )
             axes.minorticks_off()
         axes.set(ylim=(-limit, limit), xlim=(profile.edges[0], profile.edges[-1]), ylabel="residual (σ)")
-        axes.set_title(f"{name}: {_beyond(values)}".lstrip(": "), loc="left")
+        axes.set_title(f"{name}{_beyond(values)}", loc="left")
     unit = f" ({profile.unit})" if profile.unit and profile.axis != "time" else ""
     rows[-1].set_xlabel(LABELS.get(profile.axis, profile.axis) + unit)
     if profile.axis == "time" and bin_length:
@@ -81,17 +81,17 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
 
 @styled
 def residual_wall(profile: Profile) -> Figure:
-    """Signed significance over the wall, seen from it, before and after on one symmetric colour scale."""
-    both = np.abs(np.stack([profile.before, profile.after]))
-    known = both[np.isfinite(both)]
+    """Signed significance over the wall, seen from it, before and after on one symmetric scale; one map where nothing changed."""
+    panels = _panels(profile)
+    known = np.abs(np.concatenate([values[np.isfinite(values)] for values in panels.values()]))
     limit = max(3.0, float(np.quantile(known, 0.99))) if known.size else 3.0
-    figure = Figure(figsize=(9.5, 4.2))
-    panels = figure.subplots(1, 2)
-    for axes, values, name in zip(panels, (profile.before, profile.after), ("before", "after"), strict=True):
+    high = np.ptp(profile.edges_y) / np.ptp(profile.edges)
+    figure = Figure(figsize=(0.9 + 4.3 * len(panels), min(7.0, 1.1 + 3.6 * high)))
+    for axes, (name, values) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         mesh = _map(axes, values, profile.edges, profile.edges_y, cmap=SIGNED, norm=Normalize(-limit, limit))
-        axes.set_title(f"{name}: {_beyond(values)}", loc="left", fontsize="small")
+        axes.set_title(f"{name}{_beyond(values)}", loc="left", fontsize="small")
         axes.set(xlabel=f"x ({profile.unit})", ylabel=f"y ({profile.unit})")
-    _bar(mesh, "residual (σ)")
+    _bar(mesh, "residual (σ), 99 % inside")
     return figure
 
 
@@ -103,14 +103,14 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
     axes = figure.subplots()
     largest = max([s.statistic for s in ranked if np.isfinite(s.statistic)] + [100.0])
     for row, one in enumerate(ranked):
-        barely, length = could_not_be_seen(one), one.statistic if one.statistic > 1 else 1.0  # NaN: no bar
-        colour = NOTHING if barely else BLUE if one.name in accepted else SKY
-        axes.barh(
-            row, length - 1, left=1, height=0.72, color=colour, hatch="////" if barely else None, edgecolor=GREY, linewidth=0.6
-        )
+        hard, length = barely(one), one.statistic if one.statistic > 1 else 1.0  # NaN: no bar
+        colour = NOTHING if hard else BLUE if one.name in accepted else SKY
+        axes.barh(row, length - 1, left=1, height=0.72, color=colour, hatch="////" if hard else None, edgecolor=GREY, linewidth=0.6)
         axes.plot([max(one.degrees, 1)] * 2, (row - 0.36, row + 0.36), color=BLACK, linewidth=1.6)
         text = f"{number(one.statistic)}   keeps {percent(one.retained_information)}, gain {number(one.predicted_gain)} nats"
-        axes.text(length * largest**0.01, row, text, va="center", fontsize="small", color=GREY if barely else BLACK)
+        place = max(length, one.degrees) * largest**0.015
+        box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
+        axes.text(place, row, text, va="center", fontsize="small", color=GREY if hard else BLACK, bbox=box)
     axes.axvline(SEEN, color=ORANGE, linestyle="--", linewidth=1)
     names = [one.name + (" ✔" if one.name in accepted else "") for one in ranked]
     axes.set_yticks(range(len(ranked)), labels=names)
@@ -171,9 +171,7 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
         axes.plot(x, y, "o-", color=colour, label=label)
         axes.hlines(noise, x - 0.35, x + 0.35, color=GREY, linewidth=2.5, label="counting noise" if start == 0 else None)
         for place, value in zip(x, y, strict=True):
-            axes.annotate(
-                number(value, 4), (place, value), xytext=(0, 6), textcoords="offset points", ha="center", fontsize="small"
-            )
+            axes.annotate(number(value, 4), (place, value), xytext=(6, 4), textcoords="offset points", fontsize="small")
         ticks += list(x)
     labels = [name.replace("_", "_\n") if len(name) > 14 else name for _, points, *_ in groups for name, _ in points]
     axes.set_xticks(ticks, labels=labels, fontsize="small")
@@ -186,11 +184,11 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
 @styled
 def detection_limits(screened: Sequence[Screened], bin_length: float | None = None) -> Figure:
     """Smallest amplitude that this capture would have revealed, a panel for each unit; grey where the scene can imitate it."""
-    panels: dict[str, list[tuple[str, float, bool]]] = {}
+    panels: dict[str, list[tuple[str, float, bool, bool]]] = {}
     for one in screened:
         for name, value in one.detectable.items():
             factor, unit = scales(one.name, name, None, 0.0, bin_length)[0]
-            entry = (f"{one.name} · {name}", factor * value if value is not None else np.nan, could_not_be_seen(one))
+            entry = (f"{one.name} · {name}", factor * value if value is not None else np.nan, barely(one), invisible(one))
             panels.setdefault(unit or "pure number", []).append(entry)
     heights = [len(rows) + 1.5 for rows in panels.values()]
     figure = Figure(figsize=(7.5, 0.5 + 0.3 * sum(heights)))
@@ -198,10 +196,10 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
         figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0], panels.items(), strict=True
     ):
         rows.sort(key=lambda entry: np.nan_to_num(entry[1], nan=np.inf, posinf=np.inf))
-        finite = [value for _, value, _ in rows if np.isfinite(value) and value > 0]
+        finite = [value for _, value, *_ in rows if np.isfinite(value) and value > 0]
         low, high = (min(finite) / 3, max(finite) * 8) if finite else (0.1, 10.0)
-        for row, (_, value, blind) in enumerate(rows):
-            known = np.isfinite(value) and value > 0
+        for row, (_, value, blind, hidden) in enumerate(rows):
+            known = np.isfinite(value) and value > 0 and not hidden
             text = f"{number(value, 2)} {'' if unit == 'pure number' else unit}" if known else "at no strength"
             if known:
                 axes.plot([low, value], [row, row], color=NOTHING, linewidth=1.2, zorder=0)
@@ -217,6 +215,7 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
             )
         axes.set_yticks(range(len(rows)), labels=[name for name, *_ in rows])
         axes.set(xscale="log", xlim=(low, high), ylim=(len(rows) - 0.5, -0.5), xlabel=unit)
+        axes.xaxis.set_minor_formatter(NullFormatter())
     figure.suptitle("smallest strength that would have been seen", fontsize="medium")
     return figure
 
@@ -262,6 +261,12 @@ def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
 def by_gain(screened: Sequence[Screened]) -> list[Screened]:
     """Best predicted gain first, unknown ones last."""
     return sorted(screened, key=lambda s: s.predicted_gain if np.isfinite(s.predicted_gain) else -np.inf, reverse=True)
+
+
+def _panels(profile: Profile) -> dict[str, np.ndarray]:
+    """Title's beginning → values."""
+    same = np.array_equal(profile.before, profile.after, equal_nan=True)
+    return {"": profile.before} if same else {"before: ": profile.before, "after: ": profile.after}
 
 
 def _map(axes: Axes, values: np.ndarray, x: np.ndarray, y: np.ndarray, **options):

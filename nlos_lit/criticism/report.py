@@ -15,9 +15,9 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nlos_lit.criticism.plots import by_gain, diagnosis_figures
 from nlos_lit.criticism.quantities import NONE, amount, number, percent, probability, quantity
-from nlos_lit.criticism.result import Accepted, Diagnosis, Screened
+from nlos_lit.criticism.result import Accepted, Diagnosis
 from nlos_lit.criticism.style import CSS
-from nlos_lit.criticism.verdict import could_not_be_seen, misfit, rivals, sureness, tone, verdict
+from nlos_lit.criticism.verdict import barely, invisible, misfit, rivals, sureness, tone, verdict
 from nlos_lit.criticism.words import AXES, describe
 from nlos_lit.export import whole_file, write_json
 from nlos_lit.figures import save_figure
@@ -201,7 +201,7 @@ def _screened(diagnosis: Diagnosis) -> str:
     for one in by_gain(diagnosis.screened):
         step = {**one.one_step, **one.shape}
         sizes = ", ".join(f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in step.items())
-        kept = percent(one.retained_information) + (" – barely identifiable" if could_not_be_seen(one) else "")
+        kept = percent(one.retained_information) + (" (barely identifiable)" if barely(one) else "")
         title = Markup(
             f"{_text(one.name)}{' <b>✔</b>' if one.name in accepted else ''}<br><small>{_text(describe(one.name).phrase)}</small>"
         )
@@ -210,24 +210,17 @@ def _screened(diagnosis: Diagnosis) -> str:
         )
     heads = ["Effect", "Statistic", "Parameters", "p", "Retained information", "Predicted gain (nats)", "First estimate"]
     kept = "what is left of an effect's trace once scene, albedo and response have adapted"
-    return f"<p>Ranked by predicted gain. ✔ accepted. Retained information: {kept}.</p>" + _table(heads, rows)
+    rule = "A small p alone is not enough: an accepted effect also gains on held-out blocks, and beats its rivals."
+    return f"<p>Ranked by predicted gain. ✔ accepted. {rule} Retained information: {kept}.</p>" + _table(heads, rows)
 
 
 def _limits(diagnosis: Diagnosis) -> str:
-    bin_length, lines = diagnosis.capture.get("bin_length"), []
-    for title, blind in (("Could not have been seen at any strength", True), ("Would have been seen from", False)):
-        chosen = [one for one in diagnosis.screened if could_not_be_seen(one) == blind]
-        texts = [_text(one.name) if blind else f"{_text(one.name)} {_text(_smallest(one, bin_length))}" for one in chosen]
-        if texts:
-            lines.append(f"<p><b>{title}:</b> {'; '.join(texts)}.</p>")
-    return "".join(lines)
-
-
-def _smallest(one: Screened, bin_length: float | None) -> str:
-    return (
-        ", ".join(f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in one.detectable.items())
-        or "(no limit known)"
-    )
+    bin_length, rows = diagnosis.capture.get("bin_length"), []
+    for one in sorted(diagnosis.screened, key=lambda s: (not invisible(s), not barely(s))):
+        limits = ", ".join(f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in one.detectable.items())
+        remark = "barely identifiable: scene, albedo and response can imitate nearly all of it" if barely(one) else ""
+        rows.append([one.name, "at no possible strength" if invisible(one) else limits or NONE, remark])
+    return _table(["Effect", "Would have been seen from", "Remark"], rows)
 
 
 def _witness(diagnosis: Diagnosis) -> str:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from nlos_lit.criticism.quantities import headline, number, percent, probability
+from nlos_lit.criticism.quantities import headline, percent, probability
 from nlos_lit.criticism.result import Accepted, Diagnosis, Scores, Screened
-from nlos_lit.criticism.words import AXES, describe
+from nlos_lit.criticism.words import AXES, BOUNDED, describe
 
 AT_NOISE = 0.03  # excess over counting noise that is called "at the noise"
-BARELY = 0.05  # retained information below which an effect cannot be told from the scene
+BARELY = 0.05  # retained information below which the scene can imitate nearly all of an effect
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,7 @@ class Misfit:
 
 def misfit(diagnosis: Diagnosis) -> Misfit:
     """On the untouched spots where they were scored, else on the held-out ones; each fit against its own noise level."""
-    test = diagnosis.untouched_test
-    untouched = {"base", "extended"} <= set(test)
-    base, extended = (test["base"], test["extended"]) if untouched else (diagnosis.base, diagnosis.extended)
+    base, extended, untouched = _scored(diagnosis)
     before, after = _excess(base), _excess(extended)
     if not (math.isfinite(before) and math.isfinite(after)) or before <= 0:
         return Misfit(base.deviance_per_bin, 0.0, 0.0, None, untouched)
@@ -44,9 +42,15 @@ def rivals(diagnosis: Diagnosis, name: str) -> list[str]:
     return list(dict.fromkeys(other for group in diagnosis.groups if name in group for other in group if other != name))
 
 
-def could_not_be_seen(screened: Screened) -> bool:
-    """The effect looks like scene, albedo or response in this capture, at any strength."""
+def barely(screened: Screened) -> bool:
+    """Scene, albedo and response can imitate nearly all of the effect in this capture."""
     return not screened.retained_information >= BARELY  # NaN included
+
+
+def invisible(screened: Screened) -> bool:
+    """No physically possible strength would have shown."""
+    limits = screened.detectable.items()
+    return bool(limits) and all(not math.isfinite(v) or (n in BOUNDED and v > 1) for n, v in limits)
 
 
 def tone(diagnosis: Diagnosis) -> str:
@@ -62,7 +66,7 @@ def verdict(diagnosis: Diagnosis) -> str:
     found = [_one(diagnosis, effect) for effect in diagnosis.effects]
     for group in diagnosis.groups:
         if not names & set(group):
-            found.append(f"one of these, which this capture cannot tell apart: {_either(group)}")
+            found.append(f"one of these, and this capture cannot tell which: {_either(group)}")
     axis = AXES.get(diagnosis.unexplained.axis, "on some axis")
     if not found:
         return (
@@ -86,30 +90,27 @@ def sureness(diagnosis: Diagnosis) -> str:
     """How far the verdict can be trusted, in one or two sentences."""
     parts = []
     if diagnosis.effects:
-        worst = max((e.p_value for e in diagnosis.effects), key=lambda p: math.inf if math.isnan(p) else p)
-        sure = [e for e in diagnosis.effects if e.heldout_gain.ci95[0] > 0]
-        every = "every accepted effect" if len(diagnosis.effects) > 1 else "the accepted effect"
-        parts.append(f"Chance that noise alone looks like {every}: p = {probability(worst)} or less.".replace("= <", "<"))
-        whole = len(sure) == len(diagnosis.effects)
-        confirmed = "The gain holds" if whole else f"The gain of {len(sure)} of {len(diagnosis.effects)} effects holds"
-        parts.append(f"{confirmed} on wall blocks that were not fitted (95 % interval above 0).")
+        several = len(diagnosis.effects) > 1
+        known = [e.p_value for e in diagnosis.effects if math.isfinite(e.p_value)]
+        if known:
+            what = "any one of these effects" if several else "this effect"
+            parts.append(f"The chance that noise alone would look like {what} is {probability(max(known))}.")
+        sure = sum(e.heldout_gain.ci95[0] > 0 for e in diagnosis.effects)
+        gain = "The gain" if sure == len(diagnosis.effects) else f"The gain of {sure} of {len(diagnosis.effects)} effects"
+        parts.append(f"{gain} holds on wall blocks that were not fitted (95 % interval above 0).")
     if diagnosis.unexplained.significant:
-        parts.append(
-            f"What stays unexplained is not chance: p = {probability(diagnosis.unexplained.p_value)} "
-            f"(statistic {number(diagnosis.unexplained.statistic)}).".replace("= <", "<")
-        )
-    blind = [s for s in diagnosis.screened if could_not_be_seen(s)]
+        left = diagnosis.unexplained
+        parts.append(f"The chance that noise alone leaves what stays unexplained is {probability(left.p_value)}.")
     if diagnosis.screened:
-        seen = len(diagnosis.screened) - len(blind)
+        hidden = sum(invisible(s) for s in diagnosis.screened)
+        hard = sum(barely(s) and not invisible(s) for s in diagnosis.screened)
         parts.append(
-            f"{len(diagnosis.screened)} effects were tested; {seen} could have been seen in this capture, {len(blind)} could not."
+            f"Effects tested: {len(diagnosis.screened)}, of which {hard} barely identifiable in this capture, {hidden} not at all."
         )
-    toys = (
-        f"calibrated with {diagnosis.toys} simulated captures"
-        if diagnosis.toys
-        else "from theory alone: no simulated captures were run"
-    )
-    parts.append(f"p-values are {toys}.")
+    if diagnosis.toys:
+        parts.append(f"What noise alone does was checked on {diagnosis.toys} simulated captures.")
+    else:
+        parts.append("These probabilities are from theory alone: no simulated captures were run.")
     return " ".join(parts)
 
 
@@ -117,7 +118,7 @@ def _one(diagnosis: Diagnosis, effect: Accepted) -> str:
     size = headline(effect.name, effect.parameters)
     text = f"{describe(effect.name).phrase}: {size}" if size else describe(effect.name).phrase
     others = rivals(diagnosis, effect.name)
-    return f"{text} – or {_either(others)}, which this capture cannot tell apart" if others else text
+    return f"{text} (or {_either(others)}: this capture cannot tell which)" if others else text
 
 
 def _either(names: list[str]) -> str:
@@ -126,10 +127,19 @@ def _either(names: list[str]) -> str:
 
 
 def _nothing(diagnosis: Diagnosis) -> str:
-    excess = _excess(diagnosis.base) / diagnosis.base.deviance_noise
+    base, *_ = _scored(diagnosis)
+    excess = _excess(base) / base.deviance_noise
     if not excess > AT_NOISE:
         return "Nothing in the registry is needed: the fit is at the noise."
     return f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise, is not significant."
+
+
+def _scored(diagnosis: Diagnosis) -> tuple[Scores, Scores, bool]:
+    """Base and extension on the untouched spots (True) where both were scored there, else on the held-out ones."""
+    test = diagnosis.untouched_test
+    if {"base", "extended"} <= set(test):
+        return test["base"], test["extended"], True
+    return diagnosis.base, diagnosis.extended, False
 
 
 def _excess(scores: Scores) -> float:

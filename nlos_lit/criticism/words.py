@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 SHAPES = frozenset({"decay", "delay", "period", "width", "x", "y", "z", "radius", "exponent", "p"})
+BOUNDED = frozenset({"fraction", "opacity", "probability", "start", "end", "detections"})  # cannot exceed 1
 AXES = {
     "time": "along the time axis",
     "depth": "along depth",
@@ -189,13 +190,13 @@ WORDS = {
         {"decay": "time"},
     ),
     "pile_up": EffectWords(
-        "pile-up: early photons hide later ones",
+        "pile-up (early photons hide later ones)",
         "The detector counts at most one photon a laser cycle, so a high rate distorts the histogram towards early times.",
         "Attenuate to below 5 % detections a cycle, or gate out the direct pulse.",
         "{detections} counts recorded a laser cycle",
     ),
     "afterpulsing": EffectWords(
-        "afterpulsing: counts that trigger further counts",
+        "afterpulsing (counts that trigger further counts)",
         "Carriers trapped in the detector are released later and are counted again.",
         "Lengthen the hold-off time, lower the excess bias, or warm the detector a little.",
         "{probability} of the counts, τ = {decay}",

@@ -59,11 +59,12 @@ def screened() -> list[Screened]:
     found = []
     for k, name in enumerate(NAMES):
         statistic = float(np.exp(rng.uniform(0, 9)))
-        unit = {"time_drift": {"coefficients": 0.0021}, "irf_tail": {"fraction": 0.0043}}.get(name, {"strength": 0.01 * (k + 1)})
+        limits = {"time_drift": {"coefficients": 0.0021}, "irf_tail": {"fraction": 0.0043}, "pile_up": {"detections": 1.5}}
+        limit = {"ghost_pulse": {"fraction": math.inf}, **limits}.get(name, {"strength": 0.01 * (k + 1)})
         shape = {"decay": 0.15} if name == "irf_tail" else {}
         kept = {"time_offset": 0.0021, "ghost_pulse": NAN}.get(name, rng.uniform(0.1, 1))
         found.append(
-            Screened(name, statistic, math.exp(-statistic / 2), kept, 1 + k, statistic / 2 - 3, {"fraction": 0.19}, shape, unit)
+            Screened(name, statistic, math.exp(-statistic / 2), kept, 1 + k, statistic / 2 - 3, {"fraction": 0.19}, shape, limit)
         )
     return found
 
@@ -252,13 +253,13 @@ def test_verdicts():
     both = verdict(CASES["two"])
     assert both.startswith("Your simulation misses 2 things: (1) a slow detector tail")
     assert "41.3 ± 0.9 mrad along x" in both
-    assert "drifts during the scan, which this capture cannot tell apart" in both
+    assert "(or a time zero that drifts during the scan: this capture cannot tell which); modelling them" in both
     group = verdict(diagnosis(groups=[["pile_up", "time_offset"]]))
-    assert group.startswith("Your simulation misses one of these, which this capture cannot tell apart: pile-up")
+    assert group.startswith("Your simulation misses one of these, and this capture cannot tell which: pile-up")
     left = verdict(two_found(unexplained=Unexplained(True, "wall", 80.0, 1e-4)))
     assert left.endswith("Something is still wrong across the wall that no known effect explains.")
     # 0.0740 / 0.7113 above noise, not significant
-    above = diagnosis(base=Scores(0.7853, 0.7113, 0.02, 0.015))
+    above = diagnosis(base=Scores(0.7853, 0.7113, 0.02, 0.015), untouched_test={})
     assert "at the noise" not in verdict(above)
     assert "10 % above counting noise" in verdict(above)
 
@@ -275,13 +276,14 @@ def test_misfit_parts_add_up_and_keep_to_their_bounds():
 
 
 def test_sureness_is_not_more_than_there_is():
-    assert "p < 10⁻³⁰⁰" not in sureness(CASES["two"])
-    assert "p = 3 × 10⁻¹⁴ or less" in sureness(CASES["two"]).replace("3.0", "3")
+    assert "any one of these effects is 3.0 × 10⁻¹⁴. The gain holds" in sureness(CASES["two"])
     assert "200 simulated captures" in sureness(CASES["two"])
+    assert "leaves what stays unexplained is 1.0 × 10⁻⁹." in sureness(CASES["unexplained"])
     assert "no simulated captures were run" in sureness(CASES["unexplained"])
-    assert "23 effects were tested; 21 could have been seen" in sureness(CASES["nothing"])
+    assert "Effects tested: 23, of which 1 barely identifiable in this capture, 2 not at all" in sureness(CASES["nothing"])
     doubtful = dataclasses.replace(TILT, heldout_gain=Gain(1.2, 1.19, 0.001, (-0.001, 0.003)))
     assert "The gain of 1 of 2 effects holds" in sureness(two_found(effects=[TAIL, doubtful]))
+    assert "chance that noise alone would look" not in sureness(CASES["nan"])
 
 
 def test_every_number_is_on_the_page(written):
@@ -324,11 +326,16 @@ def test_markup_in_names_is_escaped(written):
     assert "<width>" not in page
 
 
-def test_the_blind_are_named():
+def test_what_could_not_have_been_seen_is_said():
     text = Page(report_html(CASES["nothing"], {})).words
-    assert "Could not have been seen at any strength: time_offset ; ghost_pulse" in text.replace("time_offset;", "time_offset ;")
-    assert "irf_tail fraction 0.430 %" in text
-    assert "time_drift coefficients 7.00 ps" in text  # 2.1 mm of path
+    limits = text[text.index("What could not have been seen") :]
+    assert "ghost_pulse at no possible strength barely identifiable" in limits
+    assert "pile_up at no possible strength" in limits  # 1.5 detections a cycle
+    assert "time_offset strength 0.167 ns barely identifiable" in limits  # 50 mm of path
+    assert "irf_tail fraction 0.430 %" in limits
+    assert "time_drift coefficients 7.00 ps" in limits  # 2.1 mm of path
+    order = [limits.index(name) for name in ("ghost_pulse", "time_offset", "irf_tail")]
+    assert order == sorted(order)
 
 
 @pytest.mark.parametrize(
