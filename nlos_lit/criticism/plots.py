@@ -157,8 +157,9 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
     steps += [("all together", extended.deviance_per_bin)] if diagnosis.effects else []
     figure = Figure(figsize=(max(5.0, 1.1 * (len(steps) + 3)), 3.6))
     axes = figure.subplots()
-    groups = [(0, steps, np.linspace(base.deviance_noise, extended.deviance_noise, len(steps)), BLUE, "held-out spots")]
-    names = [n for n in ("base", "extended") if n in test]
+    last = extended.deviance_noise if np.isfinite(extended.deviance_noise) else base.deviance_noise
+    groups = [(0, steps, np.linspace(base.deviance_noise, last, len(steps)), BLUE, "held-out spots")]
+    names = [n for n in ("base", "extended") if n in test and (n == "base" or diagnosis.effects)]
     scored = [(f"untouched:\n{n}", test[n].deviance_per_bin) for n in names]
     groups += (
         [(len(steps) + 0.5, scored, np.array([test[n].deviance_noise for n in names]), GREEN, "untouched spots")] if names else []
@@ -175,9 +176,10 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
         ticks += list(x)
     labels = [name.replace("_", "_\n") if len(name) > 14 else name for _, points, *_ in groups for name, _ in points]
     axes.set_xticks(ticks, labels=labels, fontsize="small")
-    axes.margins(x=0.08, y=0.15)
-    axes.set_ylabel("deviance per bin")
-    axes.legend(loc="upper right")
+    levels = [v for _, points, noise, *_ in groups for v in [*noise, *(value for _, value in points)] if np.isfinite(v)] or [1.0]
+    high = max(1.02 * max(levels), 1.12 * min(levels))  # a misfit of a few percent must not look like a large one
+    axes.set(xlim=(ticks[0] - 0.6, ticks[-1] + 0.8), ylim=(0.97 * min(levels), high), ylabel="deviance per bin")
+    figure.legend(loc="outside upper center", ncols=3)
     return figure
 
 

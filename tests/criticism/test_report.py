@@ -426,6 +426,8 @@ def test_deviance_steps_run_from_base_to_the_untouched_spots():
     heldout, untouched = axes.lines[:2]
     np.testing.assert_allclose(heldout.get_ydata(), [1.2417, 1.1903, 1.0862, 1.0351])
     np.testing.assert_allclose(untouched.get_ydata(), [1.3, 1.03])
+    low, high = plots.deviance_steps(CASES["nothing"]).axes[0].get_ylim()
+    assert (0.7219 - 0.7113) / (high - low) < 0.15  # 1.5 % above noise is drawn small
 
 
 def test_intervals_are_95_percent_and_show_the_null():
