@@ -15,7 +15,7 @@ from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
 from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, scatter_bins, spline_weights, spread
 from nlos_lit.parameters import BoundedParameter
-from nlos_lit.surfels import Hooks, Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels import NOTHING, Hooks, Lateral, SurfelModel, spline_sensor
 
 CELL = 0.05
 FACING = [0.0, 0.0, -1.0]
@@ -70,7 +70,7 @@ def test_one_surfel_by_hand():
     expected = CELL**2 * (0.4 / d1) ** 2 * (0.4 / d2) ** 2 / (d1**2 * d2**2)
     assert paths.contribution.item() == pytest.approx(expected, rel=1e-5)
     assert paths.length.item() == pytest.approx(d1 + d2, rel=1e-6)
-    transient = model.transients(paths.contribution, model.arrival(paths.length))[0]
+    transient = model.transients(paths, torch.tensor([0]), NOTHING)[0]
     assert transient.sum().item() == pytest.approx(expected, rel=1e-5)
     mean = ((torch.arange(300) + 0.5) * transient).sum() / transient.sum()
     assert mean.item() == pytest.approx((d1 + d2) / 0.01, abs=1e-3)
@@ -114,8 +114,8 @@ def test_plate_has_the_simulators_transients():
     centre = [[0.1 + x, 0.05 + y, 0.7 - normal[0] / normal[2] * x] for x, y in xy]
     model = build(wall(laser, sensor), centre, [normal.tolist()] * 32, quadrature=3, cell=0.05)
     model.cell = torch.tensor([step, 0.05])
-    paths = model.paths(torch.arange(12))
-    ours = model.transients(paths.contribution, model.arrival(paths.length)).double().detach()
+    spots = torch.arange(12)
+    ours = model.transients(model.paths(spots), spots, NOTHING).double().detach()
     bins = torch.arange(300) + 0.5
     assert ours.sum(1) == pytest.approx(truth.sum(1), rel=2e-3)
     mean, mean_truth = (ours @ bins.double()) / ours.sum(1), (truth @ bins.double()) / truth.sum(1)

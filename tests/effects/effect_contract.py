@@ -85,10 +85,17 @@ def probe(shape: torch.Size, seed: int = 1) -> Tensor:
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 class EffectContract:
-    """Set ``effect`` and ``values`` (parameters well away from the null; one value for all coefficients makes them differ, too)."""
+    """``class TestMine(EffectContract, effect=Mine, strength=0.2, decay=0.1)``: every parameter well away from its null.
+
+    Coefficients get from a fifth of the value to all of it.
+    """
 
     effect: ClassVar[type[Effect]]
     values: ClassVar[dict[str, float]]
+
+    def __init_subclass__(cls, *, effect: type[Effect], **values: float) -> None:
+        super().__init_subclass__()
+        cls.effect, cls.values = effect, values
 
     @pytest.fixture(params=["confocal", "exhaustive"])
     def model(self, request: pytest.FixtureRequest) -> SurfelModel:

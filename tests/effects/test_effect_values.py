@@ -11,7 +11,7 @@ import torch
 from effect_contract import BIN, GATE, SPOTS, capture, registered, scene
 from torch import Tensor
 
-from nlos_lit.effects import EFFECTS, Effect, Scan
+from nlos_lit.effects import EFFECTS, Effect, Extension, Scan
 from nlos_lit.effects.basis import smooth_basis, smooth_map_basis, spline_basis
 from nlos_lit.functional.surfel_paths import Paths
 
@@ -42,7 +42,9 @@ def hand_scan(laser: list[list[float]], sensor: list[list[float]] | None = None)
     )
 
 
-def hand_paths(laser_leg=1.0, sensor_leg=1.0, laser_cosine=1.0, sensor_cosine=1.0, centre=(0.0, 0.0, 1.0), normal=(0.0, 0.0, -1.0)) -> Paths:
+def hand_paths(
+    laser_leg=1.0, sensor_leg=1.0, laser_cosine=1.0, sensor_cosine=1.0, centre=(0.0, 0.0, 1.0), normal=(0.0, 0.0, -1.0)
+) -> Paths:
     """One spot, one surfel, one point; throughput and length are not looked at by any hook."""
     numbers = [torch.full((1, 1, 1), float(v)) for v in (1, 0, laser_leg, sensor_leg, laser_cosine, sensor_cosine)]
     return Paths(*numbers, torch.tensor([centre]), torch.tensor([normal]), torch.tensor([0.01]))
@@ -74,7 +76,7 @@ def test_specular_lobe_peaks_along_the_mirror_direction():
 
 
 def test_occlusion_blocks_legs_that_cross_the_disc():
-    # Disc of radius 0.1 at (0.25, 0, 0.5). From (0.5, 0, 0) to (0, 0, 1) the leg crosses its centre, from (0, 0, 0) it passes 0.25 beside.
+    # Disc of radius 0.1 at (0.25, 0, 0.5). The leg from (0.5, 0, 0) to (0, 0, 1) crosses its centre, that from (0, 0, 0) passes.
     scan = hand_scan([[0.5, 0, 0], [0.0, 0, 0]], [[0.0, 0, 0], [0.0, 0, 0]])
     disc = effect("occlusion", scan=scan, opacity=0.6, x=0.25, y=0.0, z=0.5, radius=0.1)
     factor = [disc.path(ONE, hand_paths(), torch.tensor([s])).item() for s in (0, 1)]
@@ -252,7 +254,9 @@ def test_backgrounds():
     leak = effect("direct_leak", amplitude=5.0, decay=4 * BIN).background(level, spots).detach()
     assert leak[[0, 6, 10]].tolist() == pytest.approx([7.0, 7.0, 2 + 5 / math.e], rel=1e-5)
     ambient = effect("ambient_map", level_map=0.1)
-    assert ambient.background(level, spots)[:, 0].detach() == pytest.approx(2 * torch.exp(ambient.field()[spots]).detach(), rel=1e-5)
+    assert ambient.background(level, spots)[:, 0].detach() == pytest.approx(
+        2 * torch.exp(ambient.field()[spots]).detach(), rel=1e-5
+    )
 
 
 def test_afterpulsing_by_hand():
@@ -337,8 +341,6 @@ def test_scan_knows_its_centre(kind):
 @pytest.mark.parametrize("built", EFFECTS, ids=lambda e: e.name)
 def test_a_fixed_laser_works(built):
     """Single-laser scans, all effects at their nulls: nothing changes."""
-    from nlos_lit.effects import Extension
-
     model, scan = scene("single")
     spots = torch.arange(SPOTS)
     assert model.expected(spots, Extension([built(scan)])) == pytest.approx(model.expected(spots), rel=1e-5, abs=1e-4)

@@ -12,119 +12,96 @@ from nlos_lit.effects.base import STAGES
 from nlos_lit.errors import UserError
 
 
-class TestRetroreflection(EffectContract):
-    effect = registered("retroreflection")
-    values = {"falloff": 2.3, "cosine": 0.4}
+class TestRetroreflection(EffectContract, effect=registered("retroreflection"), falloff=2.3, cosine=0.4):
+    pass
 
 
-class TestSpecularLobe(EffectContract):
-    effect = registered("specular_lobe")
-    values = {"strength": 0.3, "exponent": 11.0}
+class TestSpecularLobe(EffectContract, effect=registered("specular_lobe"), strength=0.3, exponent=11.0):
+    pass
 
 
-class TestOcclusion(EffectContract):
-    effect = registered("occlusion")
-    values = {"opacity": 0.7, "x": 0.05, "y": -0.08, "z": 0.25, "radius": 0.2}
+class TestOcclusion(EffectContract, effect=registered("occlusion"), opacity=0.7, x=0.05, y=-0.08, z=0.25, radius=0.2):
+    pass
 
 
-class TestHigherOrderBounces(EffectContract):
-    effect = registered("higher_order_bounces")
-    values = {"strength": 2.0}
+class TestHigherOrderBounces(EffectContract, effect=registered("higher_order_bounces"), strength=2.0):
+    pass
 
 
-class TestWallTilt(EffectContract):
-    effect = registered("wall_tilt")
-    values = {"tilt_x": 0.03, "tilt_y": -0.05}
+class TestWallTilt(EffectContract, effect=registered("wall_tilt"), tilt_x=0.03, tilt_y=-0.05):
+    pass
 
 
-class TestLaserSensorBaseline(EffectContract):
-    effect = registered("laser_sensor_baseline")
-    values = {"baseline_x": 0.03, "baseline_y": -0.02}
+class TestLaserSensorBaseline(EffectContract, effect=registered("laser_sensor_baseline"), baseline_x=0.03, baseline_y=-0.02):
+    pass
 
 
-class TestTimeDrift(EffectContract):
-    effect = registered("time_drift")
-    values = {"drift": 0.02}
+class TestTimeDrift(EffectContract, effect=registered("time_drift"), drift=0.02):
+    pass
 
 
-class TestTimingJitter(EffectContract):
-    effect = registered("timing_jitter")
-    values = {"offset": 0.03}
+class TestTimingJitter(EffectContract, effect=registered("timing_jitter"), offset=0.03):
+    pass
 
 
-class TestTimeOffset(EffectContract):
-    effect = registered("time_offset")
-    values = {"offset": 0.033}
+class TestTimeOffset(EffectContract, effect=registered("time_offset"), offset=0.033):
+    pass
 
 
-class TestClockScale(EffectContract):
-    effect = registered("clock_scale")
-    values = {"scale": 0.03}
+class TestClockScale(EffectContract, effect=registered("clock_scale"), scale=0.03):
+    pass
 
 
-class TestIrfTail(EffectContract):
-    effect = registered("irf_tail")
-    values = {"fraction": 0.2, "decay": 0.15}
+class TestIrfTail(EffectContract, effect=registered("irf_tail"), fraction=0.2, decay=0.15):
+    pass
 
 
-class TestGhostPulse(EffectContract):
-    effect = registered("ghost_pulse")
-    values = {"fraction": 0.12, "delay": 0.249}
+class TestGhostPulse(EffectContract, effect=registered("ghost_pulse"), fraction=0.12, delay=0.249):
+    pass
 
 
-class TestPowerDrift(EffectContract):
-    effect = registered("power_drift")
-    values = {"drift": 0.3}
+class TestPowerDrift(EffectContract, effect=registered("power_drift"), drift=0.3):
+    pass
 
 
-class TestWallReflectance(EffectContract):
-    effect = registered("wall_reflectance")
-    values = {"gain_map": 0.2}
+class TestWallReflectance(EffectContract, effect=registered("wall_reflectance"), gain_map=0.2):
+    pass
 
 
-class TestVignetting(EffectContract):
-    effect = registered("vignetting")
-    values = {"strength": 0.4}
+class TestVignetting(EffectContract, effect=registered("vignetting"), strength=0.4):
+    pass
 
 
-class TestAmbientMap(EffectContract):
-    effect = registered("ambient_map")
-    values = {"level_map": 0.3}
+class TestAmbientMap(EffectContract, effect=registered("ambient_map"), level_map=0.3):
+    pass
 
 
-class TestBackgroundSlope(EffectContract):
-    effect = registered("background_slope")
-    values = {"slope": 0.3}
+class TestBackgroundSlope(EffectContract, effect=registered("background_slope"), slope=0.3):
+    pass
 
 
-class TestHotSpots(EffectContract):
-    effect = registered("hot_spots")
-    values = {"extra": 1.5}
+class TestHotSpots(EffectContract, effect=registered("hot_spots"), extra=1.5):
+    pass
 
 
-class TestDirectLeak(EffectContract):
-    effect = registered("direct_leak")
-    values = {"amplitude": 3.0, "decay": 0.2}
+class TestDirectLeak(EffectContract, effect=registered("direct_leak"), amplitude=3.0, decay=0.2):
+    pass
 
 
-class TestAfterpulsing(EffectContract):
-    effect = registered("afterpulsing")
-    values = {"probability": 0.2, "decay": 0.3}
+class TestAfterpulsing(EffectContract, effect=registered("afterpulsing"), probability=0.2, decay=0.3):
+    pass
 
 
-class TestPileUp(EffectContract):
-    effect = registered("pile_up")
-    values = {"detections": 0.5}
+class TestPileUp(EffectContract, effect=registered("pile_up"), detections=0.5):
+    pass
 
 
-class TestTcspcNonlinearity(EffectContract):
-    effect = registered("tcspc_nonlinearity")
-    values = {"sine": 0.05, "cosine": -0.03, "period": 9.3}
+class TestTcspcNonlinearity(EffectContract, effect=registered("tcspc_nonlinearity"), sine=0.05, cosine=-0.03, period=9.3):
+    pass
 
 
-class TestGateEdges(EffectContract):
-    effect = registered("gate_edges")
-    values = {"start": 0.6, "end": 0.4, "width": 3.3}
+class TestGateEdges(EffectContract, effect=registered("gate_edges"), start=0.6, end=0.4, width=3.3):
+    pass
 
 
 def test_every_effect_is_tested_and_named_once():

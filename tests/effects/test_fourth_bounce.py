@@ -40,11 +40,10 @@ def all_pairs(capture: Capture, model: SurfelModel) -> tuple[np.ndarray, np.ndar
     centre, normal, albedo = (t.detach().double().numpy() for t in (model.centre(), model.normal(), model.albedo()))
     area = float(model.cell.prod()) / -normal[:, 2]
     gap = centre[None] - centre[:, None]
-    d = np.linalg.norm(gap, axis=2) + np.eye(len(d_ := centre))
+    d = np.linalg.norm(gap, axis=2) + np.eye(len(centre))
     leaving = np.maximum(np.einsum("abk,ak->ab", gap, normal), 0) / d
     arriving = np.maximum(-np.einsum("abk,bk->ab", gap, normal), 0) / d
     exchange = leaving * arriving / (d**2 + area.mean() / math.pi)
-    assert len(d_) == len(area)
     sums = []
     for l, s in zip(capture.laser, capture.sensor, strict=True):
         legs = []
@@ -79,22 +78,23 @@ def test_energy_and_arrival_are_those_of_all_pairs(confocal, per_side):
     total = ours.sum(1)
     our_mean = ours @ time / total
     our_width = np.sqrt(((time - our_mean[:, None]) ** 2 * ours).sum(1) / total)
-    print(total/energy, our_mean-mean, our_width/width)
-    assert total == pytest.approx(energy, rel=0.05)
-    assert our_mean == pytest.approx(mean, abs=BIN)
+    assert total == pytest.approx(energy, rel=0.04)
+    assert our_mean == pytest.approx(mean, abs=1.5 * BIN)
     assert our_width == pytest.approx(width, rel=0.1)
 
 
 def test_two_surfels_by_hand():
     """Surfels at (±0.4, 0, 0.8), turned by 45° towards each other: both cosines between them are √½, d = 0.8."""
-    capture, model = valley(True)
-    capture = dataclasses.replace(capture, **{n: getattr(capture, n)[:1] * [0, 0, 1] for n in ("laser", "sensor")}, counts=capture.counts[:1], scan_order=None,
-        laser_normal=capture.laser_normal[:1], sensor_normal=capture.sensor_normal[:1])
+    model = valley(True)[1]
+    wall, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+    capture = Capture(np.ones((1, N_BINS), dtype=np.uint16), wall, wall, up, up, bin_length=BIN, t_start=T_START)
     model.laser, model.sensor = torch.zeros(1, 3), torch.zeros(1, 3)
     half = math.sqrt(0.5)
     model.quadrature = 1
     model.cell = torch.tensor([0.01, 0.01])
-    model.place(torch.tensor([[-0.4, 0, 0.8], [0.4, 0, 0.8]]), torch.tensor([[half, 0, -half], [-half, 0, -half]]), torch.tensor([0.5, 0.8]))
+    model.place(
+        torch.tensor([[-0.4, 0, 0.8], [0.4, 0, 0.8]]), torch.tensor([[half, 0, -half], [-half, 0, -half]]), torch.tensor([0.5, 0.8])
+    )
     ours = fourth(capture, model)[0]
     # Legs √0.8; cosθ_wall = 0.8/√0.8, cosθ_surfel = (0.4 + 0.8) √½/√0.8; area 10⁻⁴ √2.
     area, leg = 1e-4 * math.sqrt(2), math.sqrt(0.8)
