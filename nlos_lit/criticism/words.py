@@ -172,7 +172,7 @@ WORDS = {
         "Single spots look at a reflection, a status lamp, or were recorded while someone opened a door.",
         "Look at these spots on the wall; mask or record them again.",
         "{number} spots with {level} more",
-        kinds={"level": "counts"},
+        kinds={"level": "counts", "extra": "counts"},
     ),
     "background_slope": EffectWords(
         "a background that rises or falls over the time gate",

@@ -11,15 +11,19 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+import torch
 from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from nlos_lit.capture import Capture
 from nlos_lit.criticism import plots
-from nlos_lit.criticism.quantities import amount, headline, number, plus_minus, probability, quantity
+from nlos_lit.criticism.quantities import UNIT_OF_KIND, amount, headline, number, plus_minus, probability, quantity
 from nlos_lit.criticism.report import log_figures, report_html, write_report
 from nlos_lit.criticism.result import Accepted, Diagnosis, Estimate, Gain, Profile, Scores, Screened, Unexplained
 from nlos_lit.criticism.verdict import misfit, sureness, verdict
 from nlos_lit.criticism.words import WORDS, describe
+from nlos_lit.effects import build_effects
+from nlos_lit.effects.scan import Scan
 
 NAMES = re.findall(
     r"\w+",
@@ -374,6 +378,23 @@ def test_every_effect_has_words_and_a_headline_that_works():
         assert fields
         text = headline(name, {field: Estimate(0.7, 0.1, "1") for field in fields})
         assert len(re.findall(r"\b(0\.70?|70)\b", text)) == len(fields), text
+
+
+def test_words_speak_of_the_registry_s_parameters_in_their_units():
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 5), indexing="ij")
+    wall, up = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1), np.tile([0.0, 0.0, 1.0], (25, 1))
+    counts = np.random.default_rng(2).poisson(3.0, (25, 120)).astype(np.uint16)
+    scan = Scan.of(Capture(counts, wall, wall, up, up, bin_length=0.02, gate=(30, 110)))
+    for effect in build_effects(NAMES, scan):
+        words, declared = describe(effect.name), effect.declared
+        with torch.no_grad():
+            units = {name: q.unit for name, q in effect.quantities().items()} | {p.name: p.unit for p in declared.values()}
+        assert {f"{name} {UNIT_OF_KIND[words.kind_of(name)]}" for name in units} == {f"{n} {u}" for n, u in units.items()}, (
+            effect.name
+        )
+        for p in declared.values():
+            assert words.null_of(p.name) == p.null, (effect.name, p.name)
+        assert set(re.findall(r"{(\w+)}", words.headline)) - {"share"} <= set(units), effect.name
 
 
 def test_an_effect_without_words_is_called_by_its_name():
