@@ -30,8 +30,8 @@ PAD = 16  # bins beyond either end of the window, from which light can be moved 
 
 def corner() -> Mesh:
     """Two plates that face each other and the wall, like the inside of an opened book: much light bounces twice."""
-    left = plate((0.17, 0.02, 0.75), 0.40, 0.44, turn_y=np.deg2rad(40), albedo=0.9)
-    right = plate((-0.17, 0.02, 0.75), 0.40, 0.44, turn_y=np.deg2rad(-40), albedo=0.6)
+    left = plate((0.18, 0.03, 0.76), 0.44, 0.40, turn_y=np.deg2rad(42), albedo=0.9)
+    right = plate((-0.15, -0.02, 0.78), 0.34, 0.46, turn_y=np.deg2rad(-36), albedo=0.6)
     return join(left, right)
 
 

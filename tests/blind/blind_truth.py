@@ -13,8 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from blind_inject import EFFECTS, ORDER, UNKNOWN, Work
+from blind_inject import EFFECTS, ORDER, UNKNOWN
 from blind_scenes import SIDE, available, load
+from blind_work import Work
 
 from data_modules.readers import write_capture
 from nlos_lit.capture import Capture
