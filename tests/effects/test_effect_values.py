@@ -236,6 +236,9 @@ def test_reflectance_is_one_map_of_both_wall_points():
     field = wall.field().detach()
     assert field[:40] == pytest.approx(field[40:], abs=1e-5)
     assert field.abs().max() > 0.05
+    # Both points at one place: the gain of that place twice, e^{2f}, so functions of mean square 4.
+    twice = effect("wall_reflectance", scan=hand_scan(points[0].tolist(), points[0].tolist()))
+    assert twice.functions.square().mean(0) == pytest.approx(torch.full((twice.functions.shape[1],), 4.0), rel=1e-4)
 
 
 def test_backgrounds():
