@@ -65,9 +65,9 @@ class Plan:
 
 
 PLANS: dict[str, Plan] = {
-    "default": Plan(Window(0.008, 224, 0.92), MESHES["default"], 0.8),
+    "default": Plan(Window(0.008, 224, 0.92), MESHES["default"], 0.8, 0.0145),
     "letters": Plan(Window(0.008, 224, 1.10), MESHES["letters"], 0.8),
-    "sphere_before_plate": Plan(Window(0.010, 256, 1.10), MESHES["sphere_before_plate"], 1.2, 0.014),
+    "sphere_before_plate": Plan(Window(0.010, 256, 1.10), MESHES["sphere_before_plate"], 1.2, 0.018),
     "corner": Plan(Window(0.008, 208, 1.10), corner, 0.8, 0.012),
     "z_confocal": Plan(Window(0.006, 232, 0.006 * 172), render="z_confocal_64_d3"),
     "bunny_confocal": Plan(Window(0.012, 208, 0.006 * 322), render="bunny_confocal_32_d3"),
