@@ -38,6 +38,7 @@ class RefineSettings:
         depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
         tie: weight of :meth:`SurfelModel.bending`, nats per squared radian and pair.
+        surfel_cost: nats that a surfel must be worth, see :meth:`SurfelModel.presence`.
         prune: surfels whose albedo is below this many of its standard deviations die.
         grow: places next to surfels, and unused seeds, whose score exceeds this many standard deviations get one.
         test_spots: random training spots on which scores are computed.
@@ -59,6 +60,7 @@ class RefineSettings:
     response_rate: float = 0.03
     effect_rate: float = 0.1
     tie: float = 100.0
+    surfel_cost: float = 0.0
     prune: float = 1.5
     grow: float = 3.5
     test_spots: int = 384
@@ -157,6 +159,7 @@ class SurfelFit:
         # The response waits for the places, the tie for the surface: both would otherwise settle around errors of the seeds.
         response_rate = s.response_rate * (0.3 if settling else 1.0)
         tie = s.tie * 0.3 ** max(0, left - 1) / (len(self.train) * self.counts.shape[1])
+        cost = s.surfel_cost / (len(self.train) * self.counts.shape[1])
         groups = [
             {"params": [model.raw_depth], "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
@@ -174,7 +177,7 @@ class SurfelFit:
             rows = self._batch()
             expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
             fit = (expected - torch.xlogy(self.counts[rows], expected)).mean()
-            loss = fit + tie * model.bending()
+            loss = fit + tie * model.bending() + cost * model.presence()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -165,6 +165,11 @@ class SurfelModel(nn.Module):
         albedo = self.albedo().detach()
         return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
 
+    def presence(self) -> Tensor:
+        """How many surfels there are, each counted as a/(a + ε) with ε a tenth of the mean albedo a: the weak ones feel it most."""
+        albedo = self.albedo()
+        return (albedo / (albedo + 0.1 * albedo.detach().mean())).sum()
+
     @torch.no_grad()
     def update_visibility(self, opaque: float = 0.3, skip: float = 1.5, samples: int = 32) -> None:
         """Find from which wall points each surfel's centre is hidden by the front sheet of the others.

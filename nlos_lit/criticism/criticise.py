@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from nlos_lit.capture import Capture
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
-from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with
+from nlos_lit.criticism.refit import Comparison, compare, copy_effects, log_likelihood, refit_with
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import Split
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.base import Extension
 from nlos_lit.effects.scan import Scan
 from nlos_lit.surfel_fit import SurfelFit
 
 log = logging.getLogger(__name__)
 Tell = Callable[[str], None]
+Rebuild = Callable[[Extension], SurfelFit]
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CriticismSettings:
         steps: batches of a refit (and as many again at falling rate).
         most: effects that are accepted at most.
         explained: share of the structured misfit that named effects must explain; below it, the misfit is called unexplained.
-        toys: simulated captures for the null distribution.
+        toys: simulated captures for the null distribution. processes: that work on them.
     """
 
     spots: int = 1024
@@ -49,6 +49,7 @@ class CriticismSettings:
     most: int = 5
     explained: float = 0.5
     toys: int = 0
+    processes: int = 2
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,8 @@ class Trial:
         return self.candidate.effect.name
 
 
-@dataclass
-class Step:
+@dataclass(frozen=True)
+class Turn:
     """One turn of the loop: the screening, the rivals, and who was accepted (None ends it)."""
 
     candidates: list[Candidate]
@@ -87,17 +88,18 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     """Screen all effects that the fit does not have yet, and the flexible discrepancies."""
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
-    candidates = screen(problem, [e(scan) for e in EFFECTS if e.name not in have], folds)
-    return candidates, discrepancies(problem, Projector(problem), scan)
+    projector = Projector(problem)
+    candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
+    return candidates, discrepancies(problem, projector, scan)
 
 
-def turn(fit: SurfelFit, capture: Capture, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell) -> Step:
+def turn(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell) -> Turn:
     """Screen, refit the rivals, choose."""
     tell("screening effects")
     candidates, rest = look(fit, split, scan, s, seed)
     wanted = significant(candidates, s)
     if not wanted:
-        return Step(candidates, rest, [], None, [])
+        return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
     tell("refitting the control")
     control = refit_with(fit, [], s.steps, seed)
@@ -111,8 +113,8 @@ def turn(fit: SurfelFit, capture: Capture, split: Split, scan: Scan, s: Criticis
     trials.sort(key=lambda t: -t.gain.nats)
     best = choose(trials, block)
     if best.gain.interval[0] <= 0:
-        return Step(candidates, rest, trials, None, [])
-    return Step(candidates, rest, trials, best, group_of(best, trials, candidates, block, s.similar))
+        return Turn(candidates, rest, trials, None, [])
+    return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
 
 
 def significant(candidates: list[Candidate], s: CriticismSettings) -> list[Candidate]:
@@ -139,8 +141,8 @@ def choose(trials: list[Trial], block: np.ndarray) -> Trial:
     return min(near, key=lambda t: (len(t.candidate.step) if not t.candidate.effect.per_spot else 2, -t.gain.nats))
 
 
-def group_of(best: Trial, trials: list[Trial], candidates: list[Candidate], block: np.ndarray, similar: float) -> list[str]:
-    """Names that this capture cannot tell from the best: same projected sensitivity, and as good after the refit (two errors)."""
+def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float) -> list[str]:
+    """Names that this capture cannot tell from the best: as good after the refit, or the same sensitivity and nearly as good."""
     names = []
     for other in trials:
         if other is best:
@@ -150,3 +152,73 @@ def group_of(best: Trial, trials: list[Trial], candidates: list[Candidate], bloc
         if (alike and short.nats < 0.5 * best.gain.nats) or short.nats < max(2 * short.error, 0.02 * best.gain.nats):
             names.append(other.name)
     return names
+
+
+@dataclass
+class Findings:
+    """What the loop leaves behind: the base, every turn, and the final extended fit."""
+
+    base: SurfelFit
+    final: SurfelFit
+    turns: list[Turn]
+
+    @property
+    def accepted(self) -> list[Turn]:
+        kept = {e.name for e in self.final.extension.effects}
+        return [t for t in self.turns if t.accepted is not None and t.accepted.name in kept]
+
+    @property
+    def left(self) -> list[Discrepancy]:
+        """Flexible discrepancies of the final fit."""
+        return self.turns[-1].discrepancies
+
+
+def criticise(
+    base: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell = log.debug
+) -> Findings:
+    """Find out, one after the other, which effects the capture asks for.
+
+    Args:
+        base: fitted to ``split.fit`` without effects.
+        rebuild: a fit from new seeds with the given effects, begun at their present values: surfels that imitated an effect do not
+            come back.
+        tell: what is being done now.
+    """
+    fit, turns = base, []
+    while True:
+        turns.append(turn(fit, split, scan, s, seed, tell))
+        best = turns[-1].accepted
+        if best is None:
+            break
+        tell(f"rebuilding the scene with {best.name}")
+        fit = better(rebuild(copy_effects(best.fit.extension, [])), best.fit, split)
+        if len(fit.extension.effects) == s.most:
+            candidates, rest = look(fit, split, scan, s, seed)
+            turns.append(Turn(candidates, rest, [], None, []))
+            break
+    fit = drop_needless(fit, split, s, seed, tell)
+    return Findings(base, fit, turns)
+
+
+def better(first: SurfelFit, second: SurfelFit, split: Split) -> SurfelFit:
+    """Whichever predicts the select spots better."""
+    one, two = (float(log_likelihood(f, split.select).sum()) for f in (first, second))
+    return first if one >= two else second
+
+
+def drop_needless(fit: SurfelFit, split: Split, s: CriticismSettings, seed: int, tell: Tell) -> SurfelFit:
+    """Backward: an effect accepted early may be explained by those that came later."""
+    block = split.block[split.select]
+    while len(fit.extension.effects) > 1:
+        reference = log_likelihood(refit_with(fit, [], s.steps, seed), split.select)
+        losses = []
+        for effect in fit.extension.effects:
+            tell(f"refitting without {effect.name}")
+            fewer = fit.copy(Extension([e for e in copy_effects(fit.extension, []).effects if e.name != effect.name]), seed)
+            fewer.run(1, steps=s.steps, settle=False)
+            losses.append((compare(log_likelihood(fewer, split.select), reference, block), fewer))
+        least, fewer = min(losses, key=lambda entry: entry[0].nats)
+        if least.nats > 2 * least.error:
+            break
+        fit = fewer
+    return fit

@@ -75,5 +75,3 @@ def _mean_depth(fit: SurfelFit, spots: Tensor) -> Tensor:
         light, weighted = (model.transients(p, part, NOTHING) for p in (paths, deep))
         values.append(torch.where(light > 0.01 * light.mean(), weighted / light.clamp_min(1e-30), torch.zeros_like(light)))
     return torch.cat(values)[:, model.gate[0] :]
-
-

@@ -12,6 +12,7 @@ weighs effects with one and with thirty coefficients on the same scale, and misf
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -23,6 +24,7 @@ from nlos_lit.criticism.sensitivity import Problem, weighted_columns
 from nlos_lit.effects.base import Effect
 
 FOLDS = 6
+KEPT = 16  # shapes of one effect that are tested in full
 
 
 @dataclass(frozen=True)
@@ -60,13 +62,12 @@ class Projector:
         return columns - self.nuisance @ weights.float()
 
 
-def screen(problem: Problem, effects: list[Effect], folds: Tensor) -> list[Candidate]:
+def screen(problem: Problem, projector: Projector, effects: list[Effect], folds: Tensor) -> list[Candidate]:
     """Test every effect; the largest predicted gain first.
 
     Args:
         effects: at their nulls. folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block belongs to.
     """
-    projector = Projector(problem)
     found = [_per_spot(problem, projector, e) if e.per_spot else _score(problem, projector, e, folds) for e in effects]
     return sorted(found, key=lambda c: -c.gain)
 
@@ -78,11 +79,7 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
     lower = torch.cat([torch.full((p.size,), (p.lower - p.null) / p.scale) for p in effect.amplitudes]).double()
     upper = torch.cat([torch.full((p.size,), (p.upper - p.null) / p.scale) for p in effect.amplitudes]).double()
     best: Candidate | None = None
-    for shape in shapes:
-        for name, value in shape.items():
-            effect.set(name, value)
-        raw = weighted_columns(problem, effect)
-        z = projector.off(raw)
+    for shape, raw, z in _projected(problem, projector, effect, shapes):
         k = z.shape[1]
         by_spot = z.view(spots, bins, k)
         score = torch.einsum("sbk,sb->sk", by_spot, projector.residual.view(spots, bins)).double()
@@ -105,9 +102,38 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
             direction = direction / direction.norm().clamp_min(1e-30)
             error = torch.linalg.inv(total + floor).diagonal().sqrt()
             best = Candidate(effect, max(0.0, statistic), p, retained, gain, step.float(), error.float(), shape, direction)
-    for name, value in best.shape.items():
-        effect.set(name, value)
+    _set_shape(effect, best.shape)
     return best
+
+
+def _projected(
+    problem: Problem, projector: Projector, effect: Effect, shapes: list[dict[str, float]]
+) -> Iterator[tuple[dict[str, float], Tensor, Tensor]]:
+    """Shape, its columns, its projected columns, for the shapes most worth it.
+
+    Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what costs. So shapes are
+    ranked by the score over the unprojected information first.
+    """
+    ranked = []
+    for shape in shapes:
+        _set_shape(effect, shape)
+        z = weighted_columns(problem, effect)
+        score, information = (z.T @ projector.residual).double(), (z.T @ z).double()
+        floor = 1e-9 * information.diagonal().mean() + 1e-30
+        worth = float(score @ torch.linalg.solve(information + floor * torch.eye(len(score)), score))
+        ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
+    ranked.sort(key=lambda entry: -entry[0])
+    columns = []
+    for _, shape, z in ranked[:KEPT]:
+        _set_shape(effect, shape)
+        columns.append(weighted_columns(problem, effect) if z is None else z)
+    projected = projector.off(torch.cat(columns, 1)).split(columns[0].shape[1], dim=1)
+    yield from zip([r[1] for r in ranked[:KEPT]], columns, (p.contiguous() for p in projected), strict=True)
+
+
+def _set_shape(effect: Effect, shape: dict[str, float]) -> None:
+    for name, value in shape.items():
+        effect.set(name, value)
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:

@@ -1,0 +1,90 @@
+"""Say what the simulation gets wrong about a capture: ``python diagnose.py scene=su``, or ``run=FOLDER`` of a finished run."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import time
+from pathlib import Path
+
+import hydra
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+
+from data_modules.scenes import load_scene
+from nlos_lit.build import PipelineSettings
+from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
+from nlos_lit.criticism.base import BasePipeline
+from nlos_lit.criticism.criticise import CriticismSettings, criticise
+from nlos_lit.criticism.diagnosis import assemble
+from nlos_lit.criticism.numerics import numerics
+from nlos_lit.criticism.plots import diagnosis_figures
+from nlos_lit.criticism.report import log_figures, write_report
+from nlos_lit.criticism.split import split_spots
+from nlos_lit.criticism.toys import run_toys
+from nlos_lit.criticism.verdict import verdict
+from nlos_lit.effects.base import Extension
+from nlos_lit.effects.scan import Scan
+from nlos_lit.errors import UserError
+from nlos_lit.memory import parse_bytes
+from nlos_lit.progress import Ticker, planes_progress
+from nlos_lit.runs import open_run
+from nlos_lit.surfel_fit import RefineSettings
+
+log = logging.getLogger(__name__)
+
+
+@hydra.main(version_base="1.3", config_path="conf", config_name="diagnose")
+@sentence_errors
+def main(config: DictConfig) -> None:
+    began = time.perf_counter()
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    run = None
+    if config.run is not None:
+        folder = Path(config.run)
+        if (folder / "diagnosis" / "diagnosis.json").exists():
+            raise UserError(f"{folder} already holds a diagnosis; move {folder / 'diagnosis'} away to diagnose it anew")
+        run = open_run(folder)
+    settings = OmegaConf.to_container(config, resolve=True) if run is not None else write_config(config, folder)
+    scene, model = (settings["scene"], settings["model"]) if run is None else (run.config["scene"], run.config["model"])
+    seed = settings["seed"]
+    capture = run.capture if run is not None else load_scene(scene, settings["data_dir"], seed)[0]
+    options = CriticismSettings(**settings["criticism"])
+    pipeline = BasePipeline(
+        volume=scene["volume"],
+        model=PipelineSettings(**{k: v for k, v in model.items() if k in PipelineSettings.__dataclass_fields__}),
+        surfels=RefineSettings(**settings["surfels"]),
+        budget=parse_bytes(settings["memory_budget"]),
+    )
+    split, scan = split_spots(capture), Scan.of(capture)
+    log.info("%s: %d spots to fit, %d to select, %d untouched", scene["name"], *map(len, (split.fit, split.select, split.test)))
+    if run is not None:
+        with torch.no_grad():
+            image = run.module.pipeline.phasor().cpu(), run.module.pipeline.phasor.grid
+    else:
+        with planes_progress("propagating the phasor field") as progress:
+            image = pipeline.image(capture, progress)
+    with planes_progress("fitting the base") as progress:
+        base = pipeline.fit(capture, split, image, Extension([]), seed, progress)
+    found = criticise(base, lambda e: pipeline.fit(capture, split, image, e, seed), split, scan, options, seed, log.info)
+    null = None
+    if options.toys:
+        ticker = Ticker("toys", options.toys)
+        null = run_toys(capture, base, pipeline, split, options, folder / "diagnosis" / "toys", ticker.update)
+        ticker.close()
+    checks = numerics(pipeline, capture, split, image, base, seed)
+    seconds = time.perf_counter() - began
+    diagnosis = assemble(capture, found, split, scan, options, null, checks, scene["name"], seconds, seed)
+    page = write_report(diagnosis, folder / "diagnosis")
+    log_figures(folder, diagnosis_figures(diagnosis))
+    log.info("%s", verdict(diagnosis))
+    log.info("%.0f s; %s", seconds, page)
+
+
+if __name__ == "__main__":
+    quote_numbers(sys.argv)
+    refuse_finished_folder(sys.argv[1:])
+    main()

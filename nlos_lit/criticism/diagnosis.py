@@ -1,0 +1,183 @@
+"""From the loop's findings to a :class:`~nlos_lit.criticism.result.Diagnosis`: numbers, intervals, and plain statements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from nlos_lit.capture import Capture
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.criticism.estimate import Uncertainty, polish
+from nlos_lit.criticism.refit import score
+from nlos_lit.criticism.residuals import profiles
+from nlos_lit.criticism.result import Accepted, Diagnosis, Gain, Screened, Unexplained
+from nlos_lit.criticism.screen import Candidate
+from nlos_lit.criticism.split import Split
+from nlos_lit.criticism.toys import Null
+from nlos_lit.criticism.witness import witness
+from nlos_lit.effects.base import Effect
+from nlos_lit.effects.scan import Scan
+
+SEEN = 25.0  # statistic from which on an effect counts as detectable
+SPLIT_BY = {
+    frozenset(
+        {"irf_tail", "afterpulsing"}
+    ): "a dark or ambient-only record: afterpulses follow background counts, a slow tail does not",
+    frozenset({"time_drift", "wall_tilt"}): "a second scan in another order (serpentine or column by column)",
+    frozenset({"time_drift", "time_offset"}): "a second scan in another order",
+    frozenset({"power_drift", "wall_reflectance"}): "a second scan in another order",
+    frozenset({"power_drift", "vignetting"}): "a second scan in another order",
+    frozenset({"vignetting", "wall_reflectance"}): "a capture with the optics shifted against the wall",
+    frozenset({"vignetting", "retroreflection"}): "a target of known reflectance, or a non-confocal scan",
+    frozenset({"retroreflection", "wall_reflectance"}): "the direct pulse's energy over the wall, or a non-confocal scan",
+    frozenset({"pile_up", "wall_reflectance"}): "a capture at a tenth of the laser power",
+    frozenset({"ghost_pulse", "higher_order_bounces"}): "a capture of a single flat target, where no light bounces twice",
+    frozenset({"irf_tail", "higher_order_bounces"}): "a capture of a single flat target, where no light bounces twice",
+    frozenset({"ambient_map", "hot_spots"}): "a capture with the laser off",
+    frozenset({"background_slope", "afterpulsing"}): "a capture with the laser off",
+    frozenset({"direct_leak", "gate_edges"}): "a capture with the gate opened later",
+}
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the final fit leaves unexplained, and whether that casts doubt on the names."""
+
+    unexplained: Unexplained
+    dominates: bool
+
+
+def assemble(
+    capture: Capture,
+    found: Findings,
+    split: Split,
+    scan: Scan,
+    settings: CriticismSettings,
+    null: Null | None,
+    numerics: dict[str, float],
+    name: str,
+    seconds: float,
+    seed: int,
+) -> Diagnosis:
+    """Everything the report says."""
+    base, final = found.base, found.final
+    spots = torch.from_numpy(split.fit)
+    block = torch.from_numpy(split.block[split.fit])
+    if found.accepted:
+        polish(final, Uncertainty(final, spots, final.counts, block))
+    uncertainty = Uncertainty(final, spots, final.counts, block)
+    verdicts = judge(found, split, settings)
+    effects, groups = [], []
+    for turn in [] if verdicts.dominates else found.accepted:
+        effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
+        effects.append(_accepted(turn, effect, uncertainty, split, null))
+        if turn.group:
+            groups.append([turn.accepted.name, *turn.group])
+    notes = []
+    if verdicts.dominates:
+        names = ", ".join(t.accepted.name for t in found.accepted)
+        notes.append(f"{names} improved the fit but left most of the misfit as it was, and is therefore not named")
+        final = base
+    fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
+    return Diagnosis(
+        effects=effects,
+        groups=groups,
+        unexplained=verdicts.unexplained,
+        screened=[_screened(c, null) for c in found.turns[0].candidates],
+        base=score(base, split.select),
+        extended=score(final, split.select),
+        untouched_test={"base": score(base, test), "extended": score(final, test)},
+        witness=witness(capture, final),
+        profiles=profiles(base, final, scan, fitted),
+        numerics=numerics,
+        notes=notes,
+        capture=_facts(capture, name),
+        toys=0 if null is None else null.toys,
+        seconds=seconds,
+        seed=seed,
+    )
+
+
+def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
+    """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain."""
+    rest = [d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain]
+    worst = max(rest, key=lambda d: d.gain, default=None)
+    if worst is None:
+        calm = max(found.left, key=lambda d: d.gain)
+        return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
+    share = len(split.fit) / len(split.select)
+    named = share * sum(t.accepted.gain.nats for t in found.accepted)
+    dominates = bool(found.accepted) and named < settings.explained / (1 - settings.explained) * worst.gain
+    return Verdicts(Unexplained(True, worst.axis, worst.statistic, worst.p_value), dominates)
+
+
+def _accepted(turn: Turn, effect: Effect, uncertainty: Uncertainty, split: Split, null: Null | None) -> Accepted:
+    trial = turn.accepted
+    statistic, p = trial.candidate.statistic, trial.candidate.p_value
+    if null is not None:
+        p = null.p_value(trial.candidate)
+    return Accepted(
+        name=effect.name,
+        parameters=uncertainty.parameters(effect),
+        statistic=statistic,
+        p_value=p,
+        heldout_gain=_gain(trial, split),
+        confusable_with=turn.group,
+        split_by="; ".join(sorted({SPLIT_BY.get(frozenset({effect.name, other}), "") for other in turn.group} - {""})),
+    )
+
+
+def _gain(trial: Trial, split: Split) -> Gain:
+    fit, spots = trial.fit, split.select
+    first, last = fit.capture.gate
+    photons = float(fit.capture.counts[spots, first:last].sum())
+    after = score(fit, spots).deviance_per_bin
+    bins = len(spots) * (last - first)
+    low, high = trial.gain.interval
+    return Gain(after + 2 * trial.gain.nats / bins, after, trial.gain.nats / photons, (low / photons, high / photons))
+
+
+def _screened(candidate: Candidate, null: Null | None) -> Screened:
+    effect, start = candidate.effect, 0
+    step, detectable = {}, {}
+    for p in effect.amplitudes:
+        part = slice(start, start + p.size)
+        error = candidate.error[part][torch.isfinite(candidate.error[part])]
+        if not effect.per_spot:
+            step[p.name] = (
+                float(p.scale * candidate.step[part].square().mean().sqrt())
+                if p.size > 1
+                else float(p.null + p.scale * candidate.step[part])
+            )
+        detectable[p.name] = float(SEEN**0.5 * p.scale * error.square().mean().sqrt())
+        start += p.size
+    return Screened(
+        name=effect.name,
+        statistic=candidate.statistic,
+        p_value=candidate.p_value if null is None else null.p_value(candidate),
+        retained_information=candidate.retained,
+        degrees=2 if effect.per_spot else len(candidate.step),
+        predicted_gain=candidate.gain,
+        one_step=step,
+        shape=candidate.shape,
+        detectable=detectable,
+    )
+
+
+def _facts(capture: Capture, name: str) -> dict[str, Any]:
+    first, last = capture.gate
+    order = capture.scan_order
+    return {
+        "name": name,
+        "kind": capture.kind,
+        "spots": capture.n_spots,
+        "bins": capture.n_bins,
+        "bin_length": capture.bin_length,
+        "bin_width_ps": capture.bin_width_ps,
+        "counts_per_spot": float(capture.counts[:, first:last].sum() / capture.n_spots),
+        "gate": list(capture.gate),
+        "scan_order": "raster" if np.array_equal(order, np.arange(len(order))) else "as given",
+    }

@@ -1,0 +1,24 @@
+"""What moves when only the numerics change is not physics: the base again with other numbers."""
+
+from __future__ import annotations
+
+import math
+
+from nlos_lit.capture import Capture
+from nlos_lit.criticism.base import BasePipeline
+from nlos_lit.criticism.refit import score
+from nlos_lit.criticism.split import Split
+from nlos_lit.effects.base import Extension
+from nlos_lit.surfel_fit import SurfelFit
+
+
+def numerics(pipeline: BasePipeline, capture: Capture, split: Split, image, base: SurfelFit, seed: int) -> dict[str, float]:
+    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted surfels."""
+    reference = score(base, split.select).deviance_per_bin
+    other = pipeline.fit(capture, split, image, Extension([]), seed + 1)
+    finer = base.copy(base.extension, seed)
+    finer.model.quadrature = math.ceil(1.5 * base.model.quadrature)
+    return {
+        "another random seed": score(other, split.select).deviance_per_bin - reference,
+        "finer quadrature of surfels": score(finer, split.select).deviance_per_bin - reference,
+    }
