@@ -16,19 +16,13 @@ from data_modules.scenes import load_scene
 from nlos_lit.build import PipelineSettings
 from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
 from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings, criticise
-from nlos_lit.criticism.diagnosis import assemble
-from nlos_lit.criticism.numerics import numerics
+from nlos_lit.criticism.criticise import CriticismSettings
 from nlos_lit.criticism.plots import diagnosis_figures
 from nlos_lit.criticism.report import log_figures, write_report
-from nlos_lit.criticism.split import split_spots
-from nlos_lit.criticism.toys import run_toys
+from nlos_lit.criticism.run import diagnose
 from nlos_lit.criticism.verdict import verdict
-from nlos_lit.effects.base import Extension
-from nlos_lit.effects.scan import Scan
 from nlos_lit.errors import UserError
 from nlos_lit.memory import parse_bytes
-from nlos_lit.progress import Ticker, planes_progress
 from nlos_lit.runs import open_run
 from nlos_lit.surfel_fit import RefineSettings
 
@@ -50,8 +44,7 @@ def main(config: DictConfig) -> None:
         run = open_run(folder)
     settings = OmegaConf.to_container(config, resolve=True) if run is not None else write_config(config, folder)
     scene, model = (settings["scene"], settings["model"]) if run is None else (run.config["scene"], run.config["model"])
-    seed = settings["seed"]
-    capture = run.capture if run is not None else load_scene(scene, settings["data_dir"], seed)[0]
+    capture = run.capture if run is not None else load_scene(scene, settings["data_dir"], settings["seed"])[0]
     options = CriticismSettings(**settings["criticism"])
     pipeline = BasePipeline(
         volume=scene["volume"],
@@ -59,29 +52,18 @@ def main(config: DictConfig) -> None:
         surfels=RefineSettings(**settings["surfels"]),
         budget=parse_bytes(settings["memory_budget"]),
     )
-    split, scan = split_spots(capture), Scan.of(capture)
-    log.info("%s: %d spots to fit, %d to select, %d untouched", scene["name"], *map(len, (split.fit, split.select, split.test)))
+    image = None
     if run is not None:
         with torch.no_grad():
             image = run.module.pipeline.phasor().cpu(), run.module.pipeline.phasor.grid
-    else:
-        with planes_progress("propagating the phasor field") as progress:
-            image = pipeline.image(capture, progress)
-    with planes_progress("fitting the base") as progress:
-        base = pipeline.fit(capture, split, image, Extension([]), seed, progress)
-    found = criticise(base, lambda e: pipeline.fit(capture, split, image, e, seed), split, scan, options, seed, log.info)
-    null = None
-    if options.toys:
-        ticker = Ticker("toys", options.toys)
-        null = run_toys(capture, base, pipeline, split, options, folder / "diagnosis" / "toys", ticker.update)
-        ticker.close()
-    checks = numerics(pipeline, capture, split, image, base, seed)
-    seconds = time.perf_counter() - began
-    diagnosis = assemble(capture, found, split, scan, options, null, checks, scene["name"], seconds, seed)
+    diagnosis, _ = diagnose(
+        capture, pipeline, options, name=scene["name"], seed=settings["seed"], image=image,
+        toys_folder=folder / "diagnosis" / "toys", tell=lambda text: log.info("%.0f s: %s", time.perf_counter() - began, text),
+    )  # fmt: skip
     page = write_report(diagnosis, folder / "diagnosis")
     log_figures(folder, diagnosis_figures(diagnosis))
     log.info("%s", verdict(diagnosis))
-    log.info("%.0f s; %s", seconds, page)
+    log.info("%.0f s; %s", time.perf_counter() - began, page)
 
 
 if __name__ == "__main__":

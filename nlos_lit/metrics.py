@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -24,8 +26,17 @@ def poisson_deviance(counts: Tensor, expected: Tensor) -> Tensor:
     return 2 * (torch.xlogy(counts, counts / expected.clamp_min(1e-300)) - counts + expected)
 
 
-def expected_deviance(expected: Tensor, seed: int = 0) -> Tensor:
-    """Mean Poisson deviance per bin of counts drawn from ``expected`` itself: the pure-noise level of the fit's own model."""
-    generator = torch.Generator(device=expected.device).manual_seed(seed)
-    drawn = torch.poisson(expected.double(), generator=generator)
-    return poisson_deviance(drawn, expected).mean()
+def expected_deviance(expected: Tensor, terms: int = 60) -> Tensor:
+    """Mean over all bins of the Poisson deviance that counts drawn from ``expected`` itself would have: the level of pure noise.
+
+    ``2 E[k ln(k/μ)]``, summed over k < ``terms`` on a table in ln μ for μ < 20 (error below 1e-4), 1 + 1/(6μ) + 1/(6μ²) beyond.
+    """
+    mu = torch.exp(torch.linspace(math.log(1e-6), math.log(20.0), 2000, dtype=torch.float64))
+    k = torch.arange(terms, dtype=torch.float64)[:, None]
+    weight = torch.exp(k * mu.log() - mu - torch.lgamma(k + 1))
+    table = 2 * (weight * (torch.xlogy(k, k) - k * mu.log())).sum(0)
+    value = expected.double().clamp_min(1e-6)
+    place = (value.clamp_max(20.0).log() - math.log(1e-6)) / (math.log(20.0) - math.log(1e-6)) * (len(mu) - 1)
+    low = place.floor().long().clamp(0, len(mu) - 2)
+    small = table[low] + (place - low) * (table[low + 1] - table[low])
+    return torch.where(value < 20, small, 1 + 1 / (6 * value) + 1 / (6 * value**2)).mean()

@@ -10,16 +10,17 @@ import numpy as np
 import torch
 
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
-from nlos_lit.criticism.refit import Comparison, compare, copy_effects, log_likelihood, refit_with
+from nlos_lit.criticism.refit import Comparison, compare, copy_effects, log_likelihood, refit_with, score
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import Split
 from nlos_lit.effects import EFFECTS
-from nlos_lit.effects.base import Extension
+from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.scan import Scan
 from nlos_lit.surfel_fit import SurfelFit
 
 log = logging.getLogger(__name__)
+WELL = 0.01  # retained information from which on an effect counts as well identifiable
 Tell = Callable[[str], None]
 Rebuild = Callable[[Extension], SurfelFit]
 
@@ -31,23 +32,30 @@ class CriticismSettings:
     Args:
         spots: fitted spots that score tests look at (all, where there are fewer).
         level: largest p-value, Holm-adjusted over all effects.
-        least_gain: nats that the score test must predict.
-        rivals: effects that are refitted before one is chosen.
+        least_gain: nats that the score test must predict …
+        least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
+        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds.
+        far_off: misfit over noise from which on single-path effects are finalists whatever their score.
         similar: correlation of projected sensitivities from which on two effects are one group.
         steps: batches of a refit (and as many again at falling rate).
         most: effects that are accepted at most.
         explained: share of the structured misfit that named effects must explain; below it, the misfit is called unexplained.
+        numerics: vary seed and quadrature of the base, too.
         toys: simulated captures for the null distribution. processes: that work on them.
     """
 
     spots: int = 1024
     level: float = 1e-3
-    least_gain: float = 8.0
+    least_gain: float = 25.0
+    least_share: float = 0.04
     rivals: int = 5
+    finalists: int = 3
+    far_off: float = 0.08
     similar: float = 0.9
     steps: int = 60
     most: int = 5
     explained: float = 0.5
+    numerics: bool = True
     toys: int = 0
     processes: int = 2
 
@@ -93,31 +101,84 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     return candidates, discrepancies(problem, projector, scan)
 
 
-def turn(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell) -> Turn:
-    """Screen, refit the rivals, choose."""
+def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell) -> Turn:
+    """Screen, refit the rivals, rebuild the scene with the finalists, choose.
+
+    Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
+    """
     tell("screening effects")
     candidates, rest = look(fit, split, scan, s, seed)
-    wanted = significant(candidates, s)
-    if not wanted:
+    over = excess(fit, split)
+    wanted = significant(candidates, s, over)
+    far_off = over > s.far_off * noise(fit, split)
+    if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
     tell("refitting the control")
     control = refit_with(fit, [], s.steps, seed)
     reference = log_likelihood(control, split.select)
+
+    def trial(candidate: Candidate, again: SurfelFit) -> Trial:
+        likelihood = log_likelihood(again, split.select)
+        return Trial(candidate, again, compare(reference, likelihood, block), likelihood)
+
     trials = []
     for candidate in wanted[: s.rivals]:
         tell(f"refitting with {candidate.effect.name}")
-        again = refit_with(fit, [candidate], s.steps, seed)
-        likelihood = log_likelihood(again, split.select)
-        trials.append(Trial(candidate, again, compare(reference, likelihood, block), likelihood))
+        trials.append(trial(candidate, refit_with(fit, [candidate], s.steps, seed)))
     trials.sort(key=lambda t: -t.gain.nats)
+    finalists = [(t.candidate, t.fit.extension) for t in trials[: s.finalists]]
+    if far_off:
+        tried = {c.effect.name for c, _ in finalists}
+        bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
+        finalists += [(c, copy_effects(fit.extension, [null_of(c.effect)])) for c in bending]
+    for candidate, extension in finalists:
+        tell(f"rebuilding the scene with {candidate.effect.name}")
+        trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
+    trials = best_of_each(trials)
     best = choose(trials, block)
-    if best.gain.interval[0] <= 0:
+    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / len(split.fit) / 2:
         return Turn(candidates, rest, trials, None, [])
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
 
 
-def significant(candidates: list[Candidate], s: CriticismSettings) -> list[Candidate]:
+def null_of(effect: Effect) -> Effect:
+    """A copy at its null, at the shape that was found best."""
+    copy = type(effect)(effect.scan)
+    for p in copy.shapes:
+        copy.set(p.name, effect.value(p.name).detach())
+    return copy
+
+
+def best_of_each(trials: list[Trial]) -> list[Trial]:
+    """The better of an effect's trials, the largest gain first."""
+    found: dict[str, Trial] = {}
+    for trial in sorted(trials, key=lambda t: -t.gain.nats):
+        found.setdefault(trial.name, trial)
+    return list(found.values())
+
+
+def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
+    """Nats over the fitted spots that an effect must gain.
+
+    The less of an effect the base leaves over, the more easily the base's own approximations look like it: below ``WELL`` retained
+    information it must gain more, by the root of what is missing.
+    """
+    return max(s.least_gain * max(1.0, (WELL / max(candidate.retained, 1e-6)) ** 0.5), s.least_share * over)
+
+
+def noise(fit: SurfelFit, split: Split) -> float:
+    """Deviance that counts alone have, nats over as many spots as were fitted."""
+    return score(fit, split.select).deviance_noise / 2 * fit.counts.shape[1] * len(split.fit)
+
+
+def excess(fit: SurfelFit, split: Split) -> float:
+    """Misfit beyond noise, nats over as many spots as were fitted; measured on the select spots."""
+    scores = score(fit, split.select)
+    return (scores.deviance_per_bin - scores.deviance_noise) / 2 * fit.counts.shape[1] * len(split.fit)
+
+
+def significant(candidates: list[Candidate], s: CriticismSettings, over: float) -> list[Candidate]:
     """Those whose Holm-adjusted p-value and predicted gain pass, the largest predicted gain first."""
     order = sorted(candidates, key=lambda c: c.p_value)
     passed, worst = set(), 0.0
@@ -126,7 +187,7 @@ def significant(candidates: list[Candidate], s: CriticismSettings) -> list[Candi
         if worst > s.level:
             break
         passed.add(candidate.effect.name)
-    return [c for c in candidates if c.effect.name in passed and c.gain > s.least_gain]
+    return [c for c in candidates if c.effect.name in passed and c.gain > needed(c, s, over)]
 
 
 def choose(trials: list[Trial], block: np.ndarray) -> Trial:
@@ -186,24 +247,17 @@ def criticise(
     """
     fit, turns = base, []
     while True:
-        turns.append(turn(fit, split, scan, s, seed, tell))
+        turns.append(turn(fit, rebuild, split, scan, s, seed, tell))
         best = turns[-1].accepted
         if best is None:
             break
-        tell(f"rebuilding the scene with {best.name}")
-        fit = better(rebuild(copy_effects(best.fit.extension, [])), best.fit, split)
+        fit = best.fit
         if len(fit.extension.effects) == s.most:
             candidates, rest = look(fit, split, scan, s, seed)
             turns.append(Turn(candidates, rest, [], None, []))
             break
     fit = drop_needless(fit, split, s, seed, tell)
     return Findings(base, fit, turns)
-
-
-def better(first: SurfelFit, second: SurfelFit, split: Split) -> SurfelFit:
-    """Whichever predicts the select spots better."""
-    one, two = (float(log_likelihood(f, split.select).sum()) for f in (first, second))
-    return first if one >= two else second
 
 
 def drop_needless(fit: SurfelFit, split: Split, s: CriticismSettings, seed: int, tell: Tell) -> SurfelFit:

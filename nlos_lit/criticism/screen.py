@@ -52,8 +52,12 @@ class Projector:
     def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
         x = problem.nuisance
         gram = (x.T @ x).double()
-        gram += torch.diag(problem.prior.double() + ridge * gram.diagonal().clamp_min(gram.diagonal().mean() * 1e-6))
-        self.nuisance, self.factor = x, torch.linalg.cholesky(gram)
+        diagonal = gram.diagonal().clone().clamp_min(float(gram.diagonal().mean()) * 1e-6)
+        failed = 1
+        while failed:  # single-precision products of nearly dependent columns may need more
+            self.factor, failed = torch.linalg.cholesky_ex(gram + torch.diag(problem.prior.double() + ridge * diagonal))
+            ridge *= 10
+        self.nuisance = x
         self.residual = self.off(problem.residual[:, None])[:, 0]
 
     def off(self, columns: Tensor) -> Tensor:

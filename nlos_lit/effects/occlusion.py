@@ -43,13 +43,13 @@ class Occlusion(Effect):
         nearest, farthest = max(first, last / 8) / 2, last / 2
         half = scan.half
         across = (-0.5 * half, 0.0, 0.5 * half)
-        radii = (0.2 * half, 0.4 * half)
+        radius = 0.3 * half
         return (
             Parameter("opacity", "1", 0.0, 0.2, 0.0, 1.0),
             Parameter("x", "m", None, 0.1 * half, x - 2 * half, x + 2 * half, grid=tuple(x + a for a in across)),
             Parameter("y", "m", None, 0.1 * half, y - 2 * half, y + 2 * half, grid=tuple(y + a for a in across)),
             Parameter("z", "m", None, 0.2, nearest / 10, farthest, grid=(nearest / 2,), log=True),
-            Parameter("radius", "m", None, 0.2, radii[0] / 10, 2 * half, grid=radii, log=True),
+            Parameter("radius", "m", None, 0.2, radius / 20, 2 * half, grid=(radius,), log=True),
         )
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:

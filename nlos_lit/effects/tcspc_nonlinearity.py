@@ -19,7 +19,7 @@ class TcspcNonlinearity(Effect):
 
     ``m'_t = m_t (1 + sine · sin(2πt/P) + cosine · cos(2πt/P))``, t the bin number.
 
-    Parameters: ``sine``, ``cosine`` (1), null 0. ``period`` P (bins), scanned uniformly in 1/P from 1/64 (or two periods in the
+    Parameters: ``sine``, ``cosine`` (1), null 0. ``period`` P (bins), scanned uniformly in 1/P from 1/40 (or two periods in the
     gate) to 1/2.2, with steps of 1/(1.5 gate) but at most 200 values. Quantities ``amplitude`` (1, the root of both squares) and
     ``period`` (bins).
 
@@ -37,11 +37,11 @@ class TcspcNonlinearity(Effect):
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         width = scan.gate[1] - scan.gate[0]
         high = 1 / 2.2
-        low = min(max(1 / 64, 2 / width), high / 2)
+        low = min(max(1 / 40, 2 / width), high / 2)
         n = min(MOST_PERIODS, math.ceil((high - low) * 1.5 * width) + 1)
         periods = tuple(1 / (low + (high - low) * k / (n - 1)) for k in range(n))
         waves = tuple(Parameter(name, "1", 0.0, 0.02, -0.7, 0.7) for name in ("sine", "cosine"))
-        return (*waves, Parameter("period", "bins", None, 0.01, 2.0, 4.0 * scan.n_bins, grid=periods, log=True))
+        return (*waves, Parameter("period", "bins", None, 0.01, 2.0, 50.0, grid=periods, log=True))
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)

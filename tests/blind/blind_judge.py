@@ -1,0 +1,143 @@
+"""A diagnosis of a hidden capture, and whether it was right.
+
+The code under test gets the capture file and nothing else. The oracle is told the true effect's name and goes through the same
+refits; its gain says what was there to be had.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from blind_truth import Spec, Truth, make_capture
+
+from data_modules.readers import read_capture
+from nlos_lit.build import PipelineSettings
+from nlos_lit.capture import Capture
+from nlos_lit.criticism.base import BasePipeline
+from nlos_lit.criticism.criticise import CriticismSettings, Findings
+from nlos_lit.criticism.refit import compare, copy_effects, log_likelihood, refit_with
+from nlos_lit.criticism.result import Diagnosis
+from nlos_lit.criticism.run import diagnose
+from nlos_lit.criticism.split import split_spots
+from nlos_lit.surfel_fit import RefineSettings
+
+SURFELS = RefineSettings(surfel_cost=10.0, prune=3.0)  # conf/surfels/criticism.yaml
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was hidden and what was said.
+
+    Args:
+        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over the base on spots that neither
+            fitted, scaled to the number of fitted spots. gain, oracle: nats on the select spots.
+        errors: per true quantity, (found - true)/stderr and found/true - 1.
+    """
+
+    spec: dict
+    hidden: tuple[str, ...]
+    unknown: str
+    axis: str
+    named: list[str]
+    groups: list[list[str]]
+    unexplained: str
+    statistic: float
+    gain: float
+    oracle: float
+    errors: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    values: dict[str, dict[str, float]] = field(default_factory=dict)
+    found: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    ratio: float = 1.0
+    seconds: float = 0.0
+
+    def to_dict(self) -> dict:
+        return asdict(self)
+
+    @property
+    def first_right(self) -> bool:
+        """The first name, or a member of its group, is hidden in the capture."""
+        if not self.named:
+            return False
+        group = next((g for g in self.groups if g[0] == self.named[0]), [self.named[0]])
+        return any(name in self.hidden for name in group)
+
+    @property
+    def named_or_grouped(self) -> set[str]:
+        """Every name said, alone or in a group."""
+        return set(self.named) | {name for group in self.groups for name in group}
+
+
+def pipeline_for(capture: Capture) -> BasePipeline:
+    """Settings that follow from the capture's time window alone."""
+    near, far = (length / 2 for length in capture.path_gate)
+    return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, PipelineSettings(0.1), SURFELS, 2 << 30)
+
+
+def diagnose_file(path: Path, options: CriticismSettings, seed: int = 0) -> tuple[Diagnosis, Findings, Capture]:
+    """All that the code under test is given."""
+    capture = read_capture(path, "auto")
+    pipeline = pipeline_for(capture)
+    return *diagnose(capture, pipeline, options, name=path.stem, seed=seed), capture
+
+
+def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Outcome:
+    """Hide, diagnose, judge."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.hdf5"
+        truth = make_capture(spec, path)
+        diagnosis, found, capture = diagnose_file(path, options)
+    split = split_spots(capture)
+    before = log_likelihood(found.base, split.select)
+    block = split.block[split.select]
+    gain = compare(before, log_likelihood(found.final, split.select), block).nats if diagnosis.effects else 0.0
+    best = oracle_gain(truth, found, capture, options) if oracle and truth.names else 0.0
+    return Outcome(
+        spec=asdict(spec),
+        hidden=truth.names,
+        unknown=truth.unknown,
+        axis=truth.axis,
+        named=[e.name for e in diagnosis.effects],
+        groups=diagnosis.groups,
+        unexplained=diagnosis.unexplained.axis if diagnosis.unexplained.significant else "",
+        statistic=2 * best * len(split.fit) / len(split.select),
+        gain=gain,
+        oracle=best,
+        errors=parameter_errors(truth, diagnosis),
+        values=truth.values,
+        found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
+        ratio=diagnosis.base.deviance_per_bin / diagnosis.base.deviance_noise,
+        seconds=diagnosis.seconds,
+    )
+
+
+def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings) -> float:
+    """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
+    split = split_spots(capture)
+    candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
+    warm = refit_with(found.base, candidates, options.steps, 0)
+    pipeline = pipeline_for(capture)
+    anew = pipeline.fit(capture, split, pipeline.image(capture), copy_effects(warm.extension, []), 0)
+    before, block = log_likelihood(found.base, split.select), split.block[split.select]
+    return max(compare(before, log_likelihood(f, split.select), block).nats for f in (warm, anew))
+
+
+def parameter_errors(truth: Truth, diagnosis: Diagnosis) -> dict[str, dict[str, tuple[float, float]]]:
+    """For every true quantity of every effect that was named."""
+    errors: dict[str, dict[str, tuple[float, float]]] = {}
+    for effect in diagnosis.effects:
+        for name, true in truth.values.get(effect.name, {}).items():
+            if name in effect.parameters:
+                found = effect.parameters[name]
+                sigmas = (found.value - true) / max(found.stderr, 1e-12)
+                relative = found.value / true - 1 if true else float(np.inf)
+                errors.setdefault(effect.name, {})[name] = (float(sigmas), float(relative))
+    return errors
+
+
+def one_thread() -> None:
+    """Small tensors: a second thread costs more than it brings."""
+    torch.set_num_threads(1)
