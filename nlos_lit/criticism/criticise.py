@@ -115,8 +115,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
     tell("refitting the control")
-    control = refit_with(fit, [], s.steps, seed)
-    reference = log_likelihood(control, split.select)
+    reference = control_likelihood(fit, split, s.steps, seed)
 
     def trial(candidate: Candidate, again: SurfelFit) -> Trial:
         likelihood = log_likelihood(again, split.select)
@@ -140,6 +139,12 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / len(split.fit) / 2:
         return Turn(candidates, rest, trials, None, [])
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
+
+
+def control_likelihood(fit: SurfelFit, split: Split, steps: int, seed: int) -> torch.Tensor:
+    """``[S]`` log-likelihoods of the select spots without another effect: of the fit as it is or refitted, whichever is better."""
+    both = [log_likelihood(f, split.select) for f in (fit, refit_with(fit, [], steps, seed))]
+    return max(both, key=lambda values: float(values.sum()))
 
 
 def null_of(effect: Effect) -> Effect:

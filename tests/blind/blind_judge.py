@@ -18,8 +18,8 @@ from data_modules.readers import read_capture
 from nlos_lit.build import PipelineSettings
 from nlos_lit.capture import Capture
 from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings, Findings
-from nlos_lit.criticism.refit import compare, copy_effects, log_likelihood, refit_with
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, control_likelihood
+from nlos_lit.criticism.refit import copy_effects, log_likelihood, refit_with
 from nlos_lit.criticism.result import Diagnosis
 from nlos_lit.criticism.run import diagnose
 from nlos_lit.criticism.split import split_spots
@@ -33,7 +33,7 @@ class Outcome:
     """What was hidden and what was said.
 
     Args:
-        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over the base on spots that neither
+        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control on spots that neither
             fitted, scaled to the number of fitted spots. gain, oracle: nats on the select spots.
         errors: per true quantity, (found - true)/stderr and found/true - 1.
     """
@@ -91,10 +91,9 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         truth = make_capture(spec, path)
         diagnosis, found, capture = diagnose_file(path, options)
     split = split_spots(capture)
-    before = log_likelihood(found.base, split.select)
-    block = split.block[split.select]
-    gain = compare(before, log_likelihood(found.final, split.select), block).nats if diagnosis.effects else 0.0
-    best = oracle_gain(truth, found, capture, options) if oracle and truth.names else 0.0
+    before = control_likelihood(found.base, split, options.steps, 0)
+    gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
+    best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else 0.0
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,
@@ -114,15 +113,16 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
     )
 
 
-def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings) -> float:
+def oracle_gain(
+    truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
+) -> float:
     """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
     warm = refit_with(found.base, candidates, options.steps, 0)
     pipeline = pipeline_for(capture)
     anew = pipeline.fit(capture, split, pipeline.image(capture), copy_effects(warm.extension, []), 0)
-    before, block = log_likelihood(found.base, split.select), split.block[split.select]
-    return max(compare(before, log_likelihood(f, split.select), block).nats for f in (warm, anew))
+    return max(float((log_likelihood(f, split.select) - before).sum()) for f in (warm, anew))
 
 
 def parameter_errors(truth: Truth, diagnosis: Diagnosis) -> dict[str, dict[str, tuple[float, float]]]:
