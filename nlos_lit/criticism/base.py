@@ -17,7 +17,7 @@ from nlos_lit.grid import VolumeGrid
 from nlos_lit.memory import check_machine
 from nlos_lit.refine import refine
 from nlos_lit.scan import volume_grid
-from nlos_lit.surfel_fit import Progress, RefineSettings, SurfelFit
+from nlos_lit.surfel_fit import RefineSettings, SurfelFit
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,19 @@ class BasePipeline:
     surfels: RefineSettings
     budget: int
 
-    def image(self, capture: Capture, progress: Progress | None = None) -> tuple[Tensor, VolumeGrid]:
+    def image(self, capture: Capture) -> tuple[Tensor, VolumeGrid]:
         """The phasor image of all spots, ``[nz, nx, ny]``, at the start values of Θ_pf."""
         grid = volume_grid(capture, **self.volume)
         phasor = build_pipeline(capture, grid, self.model).phasor
         plan = phasor.plan(capture, self.budget)
         check_machine(plan.total_bytes, "the phasor field")
-        phasor.prepare(capture, plan, progress=progress)
+        phasor.prepare(capture, plan)
         with torch.no_grad():
             return phasor().cpu(), grid
 
-    def fit(
-        self, capture: Capture, split: Split, image: tuple[Tensor, VolumeGrid], extension: Extension, seed: int, progress=None
-    ) -> SurfelFit:
+    def fit(self, capture: Capture, split: Split, image: tuple[Tensor, VolumeGrid], extension: Extension, seed: int) -> SurfelFit:
         """Surfels from new seeds, with the given effects."""
-        return refine(capture, *image, self.surfels, split.fit, extension=extension, progress=progress, seed=seed).fit
+        return refine(capture, *image, self.surfels, split.fit, extension=extension, seed=seed).fit
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
         """Image and fit without effects."""

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import math
 
+from torch import Tensor
+
 from nlos_lit.capture import Capture
 from nlos_lit.criticism.base import BasePipeline
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.split import Split
 from nlos_lit.effects.base import Extension
+from nlos_lit.grid import VolumeGrid
 from nlos_lit.surfel_fit import SurfelFit
 
 
-def numerics(pipeline: BasePipeline, capture: Capture, split: Split, image, base: SurfelFit, seed: int) -> dict[str, float]:
+def numerics(
+    pipeline: BasePipeline, capture: Capture, split: Split, image: tuple[Tensor, VolumeGrid], base: SurfelFit, seed: int
+) -> dict[str, float]:
     """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted surfels."""
     reference = score(base, split.select).deviance_per_bin
     other = pipeline.fit(capture, split, image, Extension([]), seed + 1)

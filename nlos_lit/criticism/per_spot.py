@@ -4,7 +4,9 @@ A spot's coefficient δ is drawn from N(0, σ²), with probability π where it i
 the spot's own score s and information F the marginal likelihood over δ is, up to what does not depend on σ (Laplace; exact for
 Gaussian counts),
 
-    ln[(1 - π) + π exp(½ σ²s²/(1 + σ²F)) / √(1 + σ²F)]    (half normal: times 2Φ of the posterior's mean in its standard deviations).
+    ln[(1 - π) + π exp(½ σ²s²/(1 + σ²F)) / √(1 + σ²F)]
+
+(half normal: the second term times 2Φ of the posterior's mean in its standard deviations).
 
 So spots that no fit saw still say whether the width is right.
 """

@@ -12,7 +12,7 @@ from torch import Tensor
 from nlos_lit.criticism.per_spot import factors, solve, sparse, spot_scores
 from nlos_lit.criticism.result import Scores
 from nlos_lit.criticism.screen import Candidate
-from nlos_lit.criticism.sensitivity import stage_order
+from nlos_lit.criticism.sensitivity import acting_order
 from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.metrics import expected_deviance, nmse, nmse_noise_floor, poisson_deviance
 from nlos_lit.surfel_fit import SurfelFit
@@ -31,7 +31,7 @@ class Comparison:
 
 def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
     """A copy of the extension with more effects at their present values, in order of application."""
-    return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=stage_order))
+    return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
 
 
 def set_step(effect: Effect, step: Tensor) -> None:

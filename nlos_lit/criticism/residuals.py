@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,7 +16,10 @@ SIDE = 16
 
 
 def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> list[Profile]:
-    """Residuals of ``spots`` ``[S]`` summed over bands of each axis, in standard deviations of their counts."""
+    """Residuals of ``spots`` ``[S]`` summed over bands of each axis, in standard deviations of their counts.
+
+    NaN where a band has no spots. The wall's edges are metres in the world frame; depth is left out where nothing has one.
+    """
     first, last = scan.gate
     counts = torch.from_numpy(before.capture.counts[spots.numpy(), first:last].astype(np.float32))
     models = [f.model.expected(spots, f.extension) for f in (before, after)]
@@ -26,7 +28,7 @@ def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> 
     def sums(band: Tensor, number: int) -> list[np.ndarray]:
         band = band.reshape(-1)
         total = [torch.zeros(number).index_add_(0, band, v.reshape(-1)) for v in (counts, *models)]
-        return [((total[0] - m) / m.clamp_min(1e-6).sqrt()).numpy() for m in total[1:]]
+        return [torch.where(m > 0, (total[0] - m) / m.sqrt(), torch.nan).numpy() for m in total[1:]]
 
     def profile(axis: str, unit: str, edges: np.ndarray, band: Tensor) -> Profile:
         return Profile(axis, unit, edges, *sums(band, len(edges) - 1))
@@ -50,12 +52,12 @@ def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> 
     place = scan.places[-1][spots]
     side = torch.clamp(((place + 1) / 2 * SIDE).long(), 0, SIDE - 1)
     wall = sums(per_spot(side[:, 0] * SIDE + side[:, 1]), SIDE**2)
-    metres = np.linspace(-scan.half, scan.half, SIDE + 1)
+    edges = [c + np.linspace(-scan.half, scan.half, SIDE + 1) for c in scan.centre.tolist()]
     found = [
         profile("time", "bin", time_edges, time),
         profile("scan", "spot", order, per_spot(banded(rank, order))),
         profile("rate", "counts/spot", rates, per_spot(banded(total, rates))),
-        Profile("wall", "m", metres, *(w.reshape(SIDE, SIDE) for w in wall), edges_y=metres),
+        Profile("wall", "m", edges[0], *(w.reshape(SIDE, SIDE) for w in wall), edges_y=edges[1]),
     ]
     if len(depths) > 1:
         inside = depth.reshape(-1) > 0

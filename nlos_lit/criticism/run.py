@@ -48,7 +48,7 @@ def diagnose(
     """
     began = time.perf_counter()
     if not capture.is_counts:
-        raise UserError("a diagnosis weighs photon counts; this capture holds expected values (a render), so draw counts from it first")
+        raise UserError("a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first")
     split, scan = split_spots(capture), Scan.of(capture)
     tell(f"{len(split.fit)} spots to fit, {len(split.select)} to select, {len(split.test)} untouched")
     if image is None:

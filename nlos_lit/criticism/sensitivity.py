@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.basis import smooth_map_basis
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
@@ -96,7 +97,7 @@ def effect_columns(model: SurfelModel, extension: Extension, spots: Tensor, effe
     ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every spot's own.
     """
     first, present = model.gate[0], list(extension.effects)
-    whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=stage_order))
+    whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
     index = list(whole.effects).index(effect)
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
     names = [(f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted]
@@ -119,12 +120,9 @@ def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> 
     return columns * problem.expected.reshape(-1, 1).rsqrt()
 
 
-STAGE_ORDER = ("path", "time", "response", "spot", "counting")
-
-
-def stage_order(effect: Effect) -> int:
-    """Sort key: stages in the order in which they act (stable, so that the registry's order stays within one)."""
-    return STAGE_ORDER.index(effect.stage)
+def acting_order(effect: Effect) -> int:
+    """Sort key: the registry's order, which is that of the light's way."""
+    return EFFECTS.index(type(effect))
 
 
 class _Forward(nn.Module):

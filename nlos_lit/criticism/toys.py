@@ -62,7 +62,10 @@ def run_toys(
     store: Path,
     tell: Callable[[int, int], None],
 ) -> Null:
-    """``settings.toys`` toys in ``settings.processes`` processes; each is kept in ``store`` as it is done, so that interrupted work goes on."""
+    """``settings.toys`` toys in ``settings.processes`` processes.
+
+    Each is kept in ``store`` as it is done, so that interrupted work goes on.
+    """
     store.mkdir(parents=True, exist_ok=True)
     todo = [k for k in range(settings.toys) if not (store / f"toy_{k}.json").exists()]
     with ProcessPoolExecutor(settings.processes, mp_context=multiprocessing.get_context("spawn")) as pool:

@@ -18,10 +18,10 @@ GAINS = ("wall_reflectance", "power_drift", "vignetting")
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
-    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None without a direct pulse."""
+    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None without the pulse."""
     first = capture.gate[0]
     before = capture.counts[:, :first].sum(1, dtype=np.float64)
-    if capture.n_spots == 0 or first == 0 or before.mean() < LEAST or not capture.confocal:
+    if first == 0 or before.mean() < LEAST or not capture.confocal:
         return None
     found: dict[str, Any] = {
         "direct_pulse_counts": float(before.mean()),
