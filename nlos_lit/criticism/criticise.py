@@ -20,6 +20,7 @@ from nlos_lit.effects.scan import Scan
 from nlos_lit.surfel_fit import SurfelFit
 
 log = logging.getLogger(__name__)
+WORK = 2e12  # multiplications of the nuisance columns with each other, half a minute of one core
 WELL = 0.01  # retained information from which on an effect counts as well identifiable
 Tell = Callable[[str], None]
 Rebuild = Callable[[Extension], SurfelFit]
@@ -30,7 +31,7 @@ class CriticismSettings:
     """How hard an effect must be asked for before it is named.
 
     Args:
-        spots: fitted spots that score tests look at (all, where there are fewer).
+        spots: fitted spots that score tests look at at most (fewer where there are very many surfels).
         level: largest p-value, Holm-adjusted over all effects.
         least_gain: nats that the score test must predict …
         least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
@@ -85,8 +86,15 @@ class Turn:
     group: list[str]
 
 
+def tested_spots(split: Split, s: CriticismSettings) -> int:
+    """How many fitted spots score tests look at; their gains are nats over these."""
+    return min(s.spots, len(split.fit))
+
+
 def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[Problem, torch.Tensor]:
-    """The weighted least-squares problem of (at most ``most``) fitted spots, and their folds."""
+    """The weighted least-squares problem of fitted spots, and their folds: ``most``, or as many as ``WORK`` products allow."""
+    columns = 2 * len(fit.model) + 64
+    most = min(most, max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
     rows = np.sort(np.random.default_rng(seed).permutation(len(split.fit))[:most])
     spots = torch.from_numpy(split.fit[rows])
     return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
@@ -108,9 +116,10 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     """
     tell("screening effects")
     candidates, rest = look(fit, split, scan, s, seed)
-    over = excess(fit, split)
+    misfit, tested = excess(fit, split), tested_spots(split, s)
+    over = misfit * tested / len(split.fit)
     wanted = significant(candidates, s, over)
-    far_off = over > s.far_off * noise(fit, split)
+    far_off = misfit > s.far_off * noise(fit, split)
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
@@ -136,7 +145,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
     trials = best_of_each(trials)
     best = choose(trials, block)
-    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / len(split.fit) / 2:
+    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested / 2:
         return Turn(candidates, rest, trials, None, [])
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
 
@@ -164,7 +173,7 @@ def best_of_each(trials: list[Trial]) -> list[Trial]:
 
 
 def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
-    """Nats over the fitted spots that an effect must gain.
+    """Nats over the tested spots that an effect must gain, ``over`` being the misfit there.
 
     The less of an effect the base leaves over, the more easily the base's own approximations look like it: below ``WELL`` retained
     information it must gain more, by the root of what is missing.
