@@ -144,6 +144,8 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         tell(f"rebuilding the scene with {candidate.effect.name}")
         trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
     trials = best_of_each(trials)
+    if not trials:
+        return Turn(candidates, rest, [], None, [])
     best = choose(trials, block)
     if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested / 2:
         return Turn(candidates, rest, trials, None, [])

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
-from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_spots
 from nlos_lit.criticism.estimate import Uncertainty, polish
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import profiles
@@ -108,9 +108,9 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
     if worst is None:
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
-    share = len(split.fit) / len(split.select)
-    named = share * sum(t.accepted.gain.nats for t in found.accepted)
-    dominates = bool(found.accepted) and named < settings.explained / (1 - settings.explained) * worst.gain
+    named = sum(t.accepted.gain.nats for t in found.accepted) / len(split.select)
+    left = worst.gain / tested_spots(split, settings)
+    dominates = bool(found.accepted) and named < settings.explained / (1 - settings.explained) * left
     return Verdicts(Unexplained(True, worst.axis, worst.statistic, worst.p_value), dominates)
 
 
