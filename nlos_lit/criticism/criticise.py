@@ -86,16 +86,15 @@ class Turn:
     group: list[str]
 
 
-def tested_spots(split: Split, s: CriticismSettings) -> int:
-    """How many fitted spots score tests look at; their gains are nats over these."""
-    return min(s.spots, len(split.fit))
+def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
+    """How many fitted spots score tests look at, ``most`` or as many as ``WORK`` products allow; gains are nats over these."""
+    columns = 2 * len(fit.model) + 64
+    return min(most, len(split.fit), max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
 
 
 def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[Problem, torch.Tensor]:
-    """The weighted least-squares problem of fitted spots, and their folds: ``most``, or as many as ``WORK`` products allow."""
-    columns = 2 * len(fit.model) + 64
-    most = min(most, max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
-    rows = np.sort(np.random.default_rng(seed).permutation(len(split.fit))[:most])
+    """The weighted least-squares problem of tested spots, and their folds."""
+    rows = np.sort(np.random.default_rng(seed).permutation(len(split.fit))[: tested_spots(fit, split, most)])
     spots = torch.from_numpy(split.fit[rows])
     return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
 
@@ -116,7 +115,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     """
     tell("screening effects")
     candidates, rest = look(fit, split, scan, s, seed)
-    misfit, tested = excess(fit, split), tested_spots(split, s)
+    misfit, tested = excess(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
     wanted = significant(candidates, s, over)
     far_off = misfit > s.far_off * noise(fit, split)

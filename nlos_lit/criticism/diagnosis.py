@@ -109,7 +109,7 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
     named = sum(t.accepted.gain.nats for t in found.accepted) / len(split.select)
-    left = worst.gain / tested_spots(split, settings)
+    left = worst.gain / tested_spots(found.final, split, settings.spots)
     dominates = bool(found.accepted) and named < settings.explained / (1 - settings.explained) * left
     return Verdicts(Unexplained(True, worst.axis, worst.statistic, worst.p_value), dominates)
 
