@@ -1,6 +1,7 @@
 """Simulate a capture of a hidden scene: ``python simulate.py scene=letters out=letters.hdf5 nx=64 ny=64``.
 
 Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen from the wall, and the mesh.
+With physical effects: ``python simulate.py scene=letters effects=[pile_up] pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
 """
 
 from __future__ import annotations
@@ -16,12 +17,18 @@ from omegaconf.errors import OmegaConfBaseException
 from data_modules.readers import write_capture
 from data_modules.simulate import SCENES, Mesh, ScanPlan, SensorModel, bunny_two_albedo, load_mesh, save_truth, simulate_capture
 from nlos_lit.command import sentence_errors
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.measure import measure
 from nlos_lit.errors import UserError
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What is simulated, and where it goes."""
+    """What is simulated, and where it goes.
+
+    ``exposure``: factor on the time each spot is looked at, and so on mean, background and direct counts.
+    ``effects``: physical effects, with strengths as ``EFFECT.PARAMETER=VALUE``.
+    """
 
     scene: str = "default"
     mesh: str | None = None
@@ -30,20 +37,45 @@ class Options:
     seed: int | None = 0
     two_sided: bool = False
     detail: float = 1.0
+    exposure: float = 1.0
+    effects: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not 0 < self.exposure < float("inf"):
+            raise UserError(f"exposure must be above 0; found {self.exposure}")
 
 
 SECTIONS = (Options, ScanPlan, SensorModel)
+EFFECT_HELP = f"effects are {', '.join(effect.name for effect in EFFECTS)}, their strengths EFFECT.PARAMETER=VALUE"
 SCENE_HELP = f"scene is one of {', '.join(SCENES)}, mesh (with mesh=FILE) or two_albedo (with mesh=FILE)"
+
+
+def strengths(arguments: list[str]) -> dict[str, float]:
+    """``EFFECT.PARAMETER`` → value, of the arguments that have a dot in their key."""
+    values = {}
+    for argument in arguments:
+        key, _, value = argument.partition("=")
+        if "." in key:
+            try:
+                values[key] = float(value)
+            except ValueError as error:
+                raise UserError(f"{key} must be a number; found {value!r}") from error
+    return values
 
 
 def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
     """``key=value`` arguments, each for the section that has that key."""
+    arguments = [argument for argument in arguments if "." not in argument.partition("=")[0]]
     names = [{field.name: field.default for field in dataclasses.fields(section)} for section in SECTIONS]
     keys = ", ".join(f"{key}={value}" for section in names for key, value in section.items())
     given = dict(argument.partition("=")[::2] for argument in arguments)
+    if "effects" in given and not given["effects"].startswith("["):
+        given["effects"] = f"[{given['effects']}]"
     for key in given:
         if not any(key in section for section in names):
-            raise UserError(f"there is no option {key!r}; the options are key=value, with these defaults: {keys}\n{SCENE_HELP}")
+            raise UserError(
+                f"there is no option {key!r}; the options are key=value, with these defaults: {keys}\n{SCENE_HELP}\n{EFFECT_HELP}"
+            )
     try:
         merged = (
             OmegaConf.merge(section, OmegaConf.from_dotlist([f"{key}={given[key]}" for key in given if key in own]))
@@ -64,9 +96,18 @@ def build(scene: str, mesh: str | None) -> Mesh:
     raise UserError(f"found scene={scene} mesh={mesh}; {SCENE_HELP}")
 
 
+def exposed(sensor: SensorModel, exposure: float) -> SensorModel:
+    """The sensor looking ``exposure`` times as long; counts per laser cycle, and so pile-up, stay what they are."""
+    counts = ("mean_counts", "background", "direct_counts")
+    return dataclasses.replace(sensor, **{name: exposure * getattr(sensor, name) for name in counts})
+
+
 @sentence_errors
 def main(arguments: list[str]) -> None:
     options, scan, sensor = parse(arguments)
+    values = strengths(arguments)
+    if values and not options.effects:
+        raise UserError(f"found {next(iter(values))}=… but no effects; name them: effects=[{next(iter(values)).partition('.')[0]}]")
     if options.out is None:
         raise UserError("say where to write: out=FILE.hdf5")
     out = Path(options.out)
@@ -75,9 +116,13 @@ def main(arguments: list[str]) -> None:
         if file.exists() and not options.overwrite:
             raise UserError(f"{file} is already there; take another name or say overwrite=true")
     mesh = build(options.scene, options.mesh)
-    capture, truth = simulate_capture(
-        mesh, scan, sensor, options.seed, two_sided=options.two_sided, detail=options.detail, progress=True
-    )
+    sensor = exposed(sensor, options.exposure)
+    how = {"two_sided": options.two_sided, "detail": options.detail, "progress": True}
+    if options.effects:
+        capture, truth = measure(mesh, scan, sensor, options.seed, options.effects, values, exposure=options.exposure, **how)
+    else:
+        capture, truth = simulate_capture(mesh, scan, sensor, options.seed, **how)
+    capture = dataclasses.replace(capture, provenance={**capture.provenance, "exposure": options.exposure})
     out.parent.mkdir(parents=True, exist_ok=True)
     write_capture(out, capture, overwrite=options.overwrite)
     save_truth(truth_file, truth)

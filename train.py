@@ -67,7 +67,7 @@ def main(config: DictConfig) -> None:
         sys.exit(130)
     if not trainer.is_global_zero:
         return
-    refined = refine_run(run, folder) if settings["refine"] else None
+    refined = refine_run(run, folder) if settings["refine"] or settings["effects"] else None
     summary = write_results(run, history, folder, time.perf_counter() - began, refined)
     nmse = summary["heldout"]["nmse"]
     log.info(
@@ -76,6 +76,9 @@ def main(config: DictConfig) -> None:
     )  # fmt: skip
     if refined is not None:
         log.info("refined by %d surfels: held-out NMSE %.4f", refined["surfels"], refined["heldout"]["nmse"])
+        for effect, reported in refined["effects"].items():
+            values = (f"{name} {q['value']:.4g} {q['unit'].removeprefix('1')}".rstrip() for name, q in reported.items())
+            log.info("%s: %s", effect, ", ".join(values))
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.effects.base import Extension
+from nlos_lit.effects.shapes import choose_shapes
 from nlos_lit.errors import UserError
 from nlos_lit.export import Points
 from nlos_lit.grid import VolumeGrid
@@ -44,7 +45,7 @@ class Scores:
 class Refined:
     """A fitted surfel model.
 
-    ``heldout``: scores over the spots that were not trained on (None where all were). ``history``: one entry a round.
+    ``heldout``: scores of the held-out spots that were given, None where there were none. ``history``: one entry a round.
     """
 
     model: SurfelModel
@@ -73,8 +74,10 @@ def refine(
     extension: Extension | None = None,
     progress: Progress | None = None,
     seed: int = 0,
+    heldout_spots: np.ndarray | None = None,
+    scan_shapes: bool = False,
 ) -> Refined:
-    """Fit surfels and response to the counts of ``train_spots``; the counts of other spots are only scored at the end.
+    """Fit surfels and response to the counts of ``train_spots``; the counts of ``heldout_spots`` are only scored at the end.
 
     Args:
         capture: raw counts and scan.
@@ -84,6 +87,9 @@ def refine(
         extension: physical effects fitted along with the surfels, in place.
         progress: called with (steps done, of how many).
         seed: of batches and tested spots.
+        heldout_spots: ``[N']`` rows to score; None scores nothing.
+        scan_shapes: after a first round start the extension's scanned parameters where the counts ask for them, instead of where
+            they are; costs one round more.
 
     Raises:
         UserError: shapes disagree, or no place of the image is significant in the counts.
@@ -97,14 +103,31 @@ def refine(
     train = torch.as_tensor(np.asarray(train_spots), dtype=torch.long)
     extension = Extension([]) if extension is None else extension
     fit = _seeded(capture, intensity.detach().cpu().float(), grid, settings, train, laser_sensor_start, extension, seed)
-    history = fit.run(settings.rounds, progress)
+    if scan_shapes and any(effect.shapes for effect in extension.effects):
+        history = _run_scanning_shapes(fit, progress)
+    else:
+        history = fit.run(settings.rounds, progress)
     model = fit.model
     normalise_albedo(model)
-    held = np.setdiff1d(np.arange(capture.n_spots), np.asarray(train_spots))
-    scores = score_spots(model, capture, torch.from_numpy(held), extension) if len(held) else None
+    held = torch.as_tensor(np.asarray([] if heldout_spots is None else heldout_spots), dtype=torch.long)
+    scores = score_spots(model, capture, held, extension) if len(held) else None
     sensor = model.laser_sensor
     parameters = {name: (p().item(), p.unit) for name, p in sensor.named_children()}
     return Refined(model, extension, fit, scores, parameters, history, time.perf_counter() - began)
+
+
+def _run_scanning_shapes(fit: SurfelFit, progress: Progress | None) -> list[dict[str, float]]:
+    """A first round, the shapes, then all other rounds (at least one)."""
+    s = fit.settings
+    later = max(1, s.rounds - 1)
+    total = s.steps * (2 + later + 1)
+
+    def told(before: int) -> Progress | None:
+        return None if progress is None else lambda done, _: progress(before + done, total)
+
+    history = fit.run(1, told(0))
+    choose_shapes(fit.model, fit.extension, fit.train[fit.tested], fit.counts[fit.tested])
+    return history + fit.run(later, told(2 * s.steps), grow_first=True, settle=False)
 
 
 @torch.no_grad()

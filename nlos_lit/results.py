@@ -12,13 +12,18 @@ import torch
 
 from nlos_lit import figures
 from nlos_lit.callbacks import History, run_figures, spot_labels, surface_points
+from nlos_lit.capture import Capture
+from nlos_lit.effects import Extension, Scan, build_effects
+from nlos_lit.effects.values import report
+from nlos_lit.errors import UserError
 from nlos_lit.export import Points, whole_file, write_json, write_points, write_volume
 from nlos_lit.geometry_metrics import SurfaceTruth, depth_map, geometry_errors
 from nlos_lit.mesh import write_mesh
 from nlos_lit.progress import planes_progress
-from nlos_lit.refine import RefineSettings, refine, score_spots
+from nlos_lit.refine import RefineSettings, refine
 from nlos_lit.runs import Run
 from nlos_lit.summary import build_summary
+from nlos_lit.surfels import SurfelModel
 
 log = logging.getLogger(__name__)
 
@@ -42,9 +47,9 @@ def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def refine_run(run: Run, folder: Path) -> dict[str, Any]:
-    """Fit surfels to the training spots from the run's image; points, mesh, figures and model in ``refined/``.
+    """Fit surfels, with the run's effects, to the training spots from its image; points, mesh, figures and model in ``refined/``.
 
-    Returns the summary's entry: scores on all held-out spots, imaging parameters, geometry errors where the truth is known.
+    Returns the summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors where truth is known.
     """
     module, capture, place = run.module, run.capture, folder / "refined"
     grid = module.pipeline.phasor.grid
@@ -52,12 +57,18 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
         intensity = module.pipeline.phasor().cpu()
     settings = RefineSettings(**run.config["surfels"])
     with planes_progress("refining surfels") as progress:
-        refined = refine(capture, intensity, grid, settings, run.data.train_spots, progress=progress, seed=run.config["seed"])
+        refined = refine(
+            capture, intensity, grid, settings, run.data.train_spots, extension=run.extension, progress=progress,
+            seed=run.config["seed"], heldout_spots=run.data.heldout_spots, scan_shapes=True,
+        )  # fmt: skip
     points = refined.points()
     write_points(place / "points.ply", points)
     mesh = write_mesh(place / "mesh.ply", points, depth=run.config["export"]["mesh_depth"])
     with whole_file(place / "surfels.pt") as temporary:
         torch.save(refined.model.state_dict(), temporary)
+    with whole_file(place / "effects.pt") as temporary:
+        names = [effect.name for effect in refined.extension.effects]
+        torch.save({"names": names, "state": refined.extension.state_dict()}, temporary)
     spots = shown_spots(capture.n_spots, run.config["monitor"]["spots"])
     path = capture.path_gate[0] + (np.arange(capture.gate[1] - capture.gate[0]) + 0.5) * capture.bin_length
     with torch.no_grad():
@@ -65,15 +76,37 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
     shown = figures.transients_plot(capture.gated_counts()[spots], rendered, path, spot_labels(capture, spots))
     figures.save_figure(shown, place / "transients.png")
     figures.save_figure(figures.surface_plot(points), place / "surface.png")
-    heldout = score_spots(refined.model, capture, torch.from_numpy(run.data.heldout_spots))
     return {
         "surfels": len(refined.model),
-        "heldout": dataclasses.asdict(heldout),
+        "heldout": dataclasses.asdict(refined.heldout),
         "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in refined.parameters.items()},
+        "effects": report(refined.extension.effects),
         "geometry": _geometry(points, run),
         "seconds": refined.seconds,
         "mesh": {"vertices": mesh.vertices, "triangles": mesh.triangles, "reason": mesh.reason},
     }
+
+
+def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Extension]:
+    """Surfels and effects that a run left in ``folder``; ``model.expected(spots, extension)`` are its expected counts.
+
+    Args:
+        capture: the run's, as :func:`~nlos_lit.runs.open_run` gives it.
+
+    Raises:
+        UserError: the run was not refined.
+    """
+    place = Path(folder) / "refined"
+    for name in ("surfels.pt", "effects.pt"):
+        if not (place / name).exists():
+            raise UserError(
+                f"{folder} holds no refined surfels: refined/{name} is missing; run train.py with refine=true or effects=[…]"
+            )
+    saved = torch.load(place / "effects.pt", map_location="cpu", weights_only=True)
+    extension = Extension(build_effects(saved["names"], Scan.of(capture)))
+    extension.load_state_dict(saved["state"])
+    model = SurfelModel.from_state(capture, torch.load(place / "surfels.pt", map_location="cpu", weights_only=True))
+    return model, extension
 
 
 def _geometry(points: Points, run: Run) -> dict[str, float] | None:

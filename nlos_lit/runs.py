@@ -18,6 +18,7 @@ from data_modules.scenes import load_scene
 from data_modules.spots import CaptureDataModule
 from nlos_lit.build import PipelineSettings, build_pipeline, match_energy, normalisation
 from nlos_lit.capture import Capture
+from nlos_lit.effects import Extension, Scan, build_effects
 from nlos_lit.errors import UserError
 from nlos_lit.geometry_metrics import SurfaceTruth
 from nlos_lit.memory import check_machine, parse_bytes
@@ -32,7 +33,7 @@ _MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_pla
 
 @dataclass
 class Run:
-    """A capture with the module that is fitted to it."""
+    """A capture with the module that is fitted to it, and effects, at their nulls, that are fitted with the surfels."""
 
     config: dict[str, Any]
     capture: Capture
@@ -41,6 +42,7 @@ class Run:
     module: SelfCalibration
     setup_seconds: float
     estimated_bytes: int
+    extension: Extension
 
 
 def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -> Run:
@@ -52,6 +54,8 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
     began = time.perf_counter()
     scene, seed = config["scene"], int(config["seed"])
     capture, truth = load_scene(scene, config["data_dir"], seed)
+    effects = config.get("effects", [])  # of older runs' folders: none
+    extension = Extension(build_effects([effects] if isinstance(effects, str) else effects, Scan.of(capture)))
     grid = volume_grid(capture, **scene["volume"])
     data = CaptureDataModule(
         capture,
@@ -92,7 +96,7 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
         clip=model["clip"],
         seed=seed,
     )
-    return Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated)
+    return Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated, extension)
 
 
 def open_run(folder: str | Path) -> Run:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import numpy as np
@@ -12,7 +13,9 @@ from omegaconf import OmegaConf
 
 from nlos_lit.build import PipelineSettings
 from nlos_lit.capture import Capture
+from nlos_lit.criticism.criticise import CriticismSettings
 from nlos_lit.scan import volume_grid
+from nlos_lit.surfel_fit import RefineSettings
 
 CONF = ROOT / "conf"
 
@@ -28,12 +31,18 @@ def composed(*overrides: str, command: str = "train") -> dict:
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
 
 
-GROUPS = ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels")
+GROUPS = {
+    "train": ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels"),
+    "diagnose": ("scene", "model", "surfels", "criticism"),
+    "reconstruct": ("scene", "method"),
+}
 
 
-@pytest.mark.parametrize(("group", "name"), [(g, n) for g in GROUPS for n in names(g)])
-def test_every_config_composes(group, name):
-    config = composed(f"{group}={name}")
+@pytest.mark.parametrize(
+    ("command", "group", "name"), [(c, g, n) for c, groups in GROUPS.items() for g in groups for n in names(g)]
+)
+def test_every_config_composes(command, group, name):
+    config = composed(f"{group}={name}", command=command)
     assert config["scene"]["volume"]["depth"][0] < config["scene"]["volume"]["depth"][1]
 
 
@@ -80,13 +89,31 @@ def leaves(config: dict, above: str = "") -> list[str]:
 
 
 def test_no_key_that_nothing_reads():
-    sources = "".join(
-        path.read_text() for folder in ("nlos_lit", "data_modules") for path in (ROOT / folder).rglob("*.py")
-    ) + "".join((ROOT / f"{name}.py").read_text() for name in ("train", "reconstruct"))
-    keys = {key for scene in names("scene") for key in leaves(composed(f"scene={scene}"))}
-    keys |= {key for method in names("method") for key in leaves(composed(f"method={method}", command="reconstruct"))}
+    modules = [path for folder in ("nlos_lit", "data_modules") for path in (ROOT / folder).rglob("*.py")]
+    sources = "".join(path.read_text() for path in (*modules, *(ROOT / f"{command}.py" for command in GROUPS)))
+    keys = {
+        key
+        for command, groups in GROUPS.items()
+        for group in groups
+        for name in names(group)
+        for key in leaves(composed(f"{group}={name}", command=command))
+    }
+    assert {"effects", "refine", "toys", "run", "threads"} <= keys
     unread = {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", sources)}
     assert not unread
+
+
+def test_groups_are_the_settings_that_read_them():
+    """Keys that a settings class does not know would only fail when the command runs."""
+    for name in names("criticism"):
+        settings = composed(f"criticism={name}", command="diagnose")["criticism"]
+        assert set(settings) == {f.name for f in dataclasses.fields(CriticismSettings)}
+        CriticismSettings(**settings)
+    for name in names("surfels"):
+        for command in ("train", "diagnose"):
+            settings = composed(f"surfels={name}", command=command)["surfels"]
+            assert set(settings) == {f.name for f in dataclasses.fields(RefineSettings)}
+            RefineSettings(**settings)
 
 
 def test_the_model_profiles_are_complete_settings():

@@ -13,6 +13,8 @@ from data_modules.simulate.scenes import plate
 from data_modules.spots import heldout_mask
 from nlos_lit.build import PipelineSettings, build_pipeline
 from nlos_lit.capture import Capture
+from nlos_lit.effects import Extension, Scan, build_effects
+from nlos_lit.effects.shapes import choose_shapes
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.refine import RefineSettings, refine
@@ -59,7 +61,13 @@ def fitted():
     capture, held = scene()
     intensity, grid = image(capture)
     train = np.flatnonzero(~held)
-    return capture, held, intensity, grid, refine(capture, intensity, grid, QUICK, train, seed=0)
+    return (
+        capture,
+        held,
+        intensity,
+        grid,
+        refine(capture, intensity, grid, QUICK, train, seed=0, heldout_spots=np.flatnonzero(held)),
+    )
 
 
 def test_reaches_the_noise_on_held_out_spots(fitted):
@@ -97,8 +105,9 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
     counts = capture.counts.copy()
     counts[held] = 7 * counts[held][:, ::-1] + 1
     changed = dataclasses.replace(capture, counts=counts)
-    first, again = (refine(capture, intensity, grid, short, train, seed=4) for _ in range(2))
-    blind = refine(changed, intensity, grid, short, train, seed=4)
+    scored = np.flatnonzero(held)
+    first, again = (refine(capture, intensity, grid, short, train, seed=4, heldout_spots=scored) for _ in range(2))
+    blind = refine(changed, intensity, grid, short, train, seed=4, heldout_spots=scored)
     other = refine(capture, intensity, grid, short, train, seed=5)
     for name, value in first.model.state_dict().items():
         if isinstance(value, torch.Tensor):
@@ -106,6 +115,61 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
             assert torch.equal(value, blind.model.state_dict()[name])
     assert blind.heldout.deviance_per_bin > 2 * first.heldout.deviance_per_bin
     assert first.parameters != other.parameters
+
+
+def test_only_the_given_spots_are_scored(fitted):
+    capture, held, intensity, grid, _ = fitted
+    short, train = dataclasses.replace(QUICK, rounds=1, steps=2), np.flatnonzero(~held)
+    assert refine(capture, intensity, grid, short, train).heldout is None
+    some = np.flatnonzero(held)[5:25]
+    result = refine(capture, intensity, grid, short, train, heldout_spots=some)
+    counts, expected = capture.gated_counts()[some].astype(float), result.expected(torch.from_numpy(some)).double().numpy()
+    assert result.heldout.nmse == pytest.approx(((counts - expected) ** 2).sum() / (counts**2).sum(), rel=1e-4)
+
+
+def rippled(capture: Capture, period: float, height: float) -> Capture:
+    """Bins that ripple: counts drawn anew from scaled ones keep Poisson statistics where they get thinner."""
+    ripple = (1 + height * np.sin(2 * np.pi * np.arange(capture.n_bins) / period)) / (1 + height)
+    return dataclasses.replace(capture, counts=np.random.default_rng(3).binomial(capture.counts, ripple).astype(np.uint16))
+
+
+def test_effects_are_fitted_along_and_their_shapes_found(fitted):
+    """The grid's middle, a period of 4 bins, is nowhere near the true one."""
+    capture, held, intensity, grid, _ = fitted
+    rough, train = rippled(capture, 11.3, 0.2), np.flatnonzero(~held)
+    settings = dataclasses.replace(QUICK, rounds=2)
+    seen, scores = [], {}
+    for scan_shapes in (False, True):
+        extension = Extension(build_effects(["tcspc_nonlinearity"], Scan.of(rough)))
+        result = refine(
+            rough, intensity, grid, settings, train, extension=extension, heldout_spots=np.flatnonzero(held),
+            scan_shapes=scan_shapes, progress=lambda done, total: seen.append((done, total)),
+        )  # fmt: skip
+        scores[scan_shapes] = result.heldout.deviance_per_bin / result.heldout.deviance_noise
+        ripple = {name: q.value.item() for name, q in result.extension.effects[0].quantities().items()}
+        assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
+    assert ripple["amplitude"] == pytest.approx(0.2, abs=0.03)
+    assert scores[True] < scores[False] - 0.02
+    assert seen[180:] == [(k, 240) for k in range(1, 241)]
+
+
+def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
+    """Everything but the effects is true here: the fitted model, its counts drawn with a tail."""
+    capture, _, _, _, result = fitted
+    model, spots = result.model, torch.arange(capture.n_spots)
+    scan = Scan.of(capture)
+    (tail,) = build_effects(["irf_tail"], scan)
+    tail.set("fraction", 0.25)
+    tail.set("decay", 25 * BIN)
+    expected = model.expected(spots, Extension([tail]))
+    counts = torch.poisson(expected, generator=torch.Generator().manual_seed(0))
+    found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
+    choose_shapes(model, found, spots, counts)
+    fitted_tail, wall, leak = found.effects
+    assert fitted_tail.value("decay").item() == pytest.approx(25 * BIN)
+    assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
+    assert leak.value("amplitude").item() < 0.02
+    assert wall.value("gain_map").abs().max() == 0
 
 
 def test_progress_counts_every_step(fitted):
@@ -131,7 +195,7 @@ def test_high_ambient_light_seeds_few_and_finds_the_scene(fitted):
     bright = capture.counts + np.random.default_rng(1).poisson(12.0, capture.counts.shape).astype(np.uint16)
     capture = dataclasses.replace(capture, counts=bright)
     intensity, grid = image(capture)
-    result = refine(capture, intensity, grid, QUICK, np.flatnonzero(~held))
+    result = refine(capture, intensity, grid, QUICK, np.flatnonzero(~held), heldout_spots=np.flatnonzero(held))
     assert len(result.model) < 2 * len(clean.model)
     assert result.parameters["background"][0] == pytest.approx(12.15, rel=0.02)
     assert result.heldout.deviance_per_bin < 1.05 * result.heldout.deviance_noise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import signal
 import subprocess
@@ -18,7 +19,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from nlos_lit.effects.values import report
+from nlos_lit.errors import UserError
 from nlos_lit.export import read_points, read_volume
+from nlos_lit.refine import score_spots
+from nlos_lit.results import load_refined
 from nlos_lit.runs import open_run, prepare_run
 
 SMALL = [
@@ -48,7 +53,7 @@ def state(folder: Path) -> dict:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run") / "one"
-    train("scene.iterations=6", "refine=true", "surfels.rounds=2", "surfels.steps=40", folder=folder)
+    train("scene.iterations=6", "effects=[wall_reflectance,irf_tail]", "surfels.rounds=2", "surfels.steps=40", folder=folder)
     return folder
 
 
@@ -84,7 +89,32 @@ def test_refinement_is_exported_like_any_other_result(finished):
     assert refined["heldout"]["nmse"] < phasor["nmse"]["final"]
     assert refined["geometry"]["depth_median_abs"] < 0.05
     assert len(read_points(finished / "refined" / "points.ply")) == refined["surfels"]
-    assert {path.name for path in (finished / "refined").iterdir()} >= {"points.ply", "surfels.pt", "transients.png", "surface.png"}
+    left = {path.name for path in (finished / "refined").iterdir()}
+    assert left >= {"points.ply", "surfels.pt", "effects.pt", "transients.png", "surface.png"}
+
+
+def test_effects_are_refined_along_and_open_again(finished):
+    refined = json.loads((finished / "summary.json").read_text())["refined"]
+    effects = refined["effects"]
+    assert list(effects) == ["irf_tail", "wall_reflectance"]
+    assert set(effects["irf_tail"]) == {"fraction", "decay"}
+    assert effects["irf_tail"]["decay"]["unit"] == "m"
+    assert effects["wall_reflectance"]["rms"]["value"] > 0
+    text = (finished / "train.log").read_text()
+    assert f"wall_reflectance: rms {effects['wall_reflectance']['rms']['value']:.4g}\n" in text
+    run = open_run(finished)
+    model, extension = load_refined(finished, run.capture)
+    assert report(extension.effects) == effects
+    assert len(model) == refined["surfels"]
+    scores = score_spots(model, run.capture, torch.from_numpy(run.data.heldout_spots), extension)
+    assert dataclasses.asdict(scores) == pytest.approx(refined["heldout"], rel=1e-6)
+    without = score_spots(model, run.capture, torch.from_numpy(run.data.heldout_spots))
+    assert without.deviance_per_bin != pytest.approx(scores.deviance_per_bin, rel=1e-4)
+
+
+def test_a_run_without_refinement_has_no_surfels_to_load(tmp_path):
+    with pytest.raises(UserError, match=r"refined/surfels\.pt is missing; run train\.py with refine=true"):
+        load_refined(tmp_path, None)
 
 
 def test_tensorboard_events_hold_losses_parameters_and_figures(finished):
@@ -205,6 +235,7 @@ BAD = {
     "scene.gate=[200,200]": "leaves no bins",
     "scene.volume.depth=[5,6]": "lies outside the capture's time window",
     "scene.volume.depth=[0.9,0.4]": "nearest < farthest",
+    "effects=[irf_tail,pileup]": "no effect 'pileup'; choose from retroreflection",
     "memory_budget=1MiB": "the budget is",
     "memory_budget=lots": "must be a size",
     "model.threshold=1.5": "threshold must lie between 0 and 1",

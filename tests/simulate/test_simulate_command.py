@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -33,6 +34,45 @@ def test_writes_a_capture_and_its_truth(tmp_path, capsys):
     assert capture.laser == pytest.approx(np.tile([0.1, -0.1, 0.0], (12, 1)))
     assert capture.counts.sum() == pytest.approx(12 * 1500, rel=0.05)
     assert np.isfinite(load_truth(out.with_name("letters_truth.h5")).depth).any()
+
+
+def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
+    out = tmp_path / "x.hdf5"
+    small = [*SMALL, "sigma=0.02", "scene=letters", "seed=1"]
+    simulate.main(
+        [f"out={out}", "effects=[pile_up,hot_spots]", "pile_up.detections=0.4", "hot_spots.level=2", "exposure=3", *small]
+    )
+    capture = read_capture(out)
+    told = capture.provenance["effects"]
+    assert told["pile_up"]["detections"]["value"] == pytest.approx(0.4)
+    assert told["hot_spots"]["level"]["value"] == pytest.approx(6)
+    assert capture.provenance["exposure"] == 3
+    simulate.main([f"out={tmp_path / 'y.hdf5'}", "exposure=3", *small])
+    plain = read_capture(tmp_path / "y.hdf5")
+    assert plain.counts.sum() == pytest.approx(3 * 12 * (1500 + 10), rel=0.02)
+    assert plain.provenance["sensor"]["background"] == pytest.approx(0.3)
+    # Cycles that record one photon at most: 0.4 a cycle of the -ln(1 - 0.4) that arrive, if all spots were equally bright.
+    hot = 6 * 100
+    assert capture.counts.sum() == pytest.approx((plain.counts.sum() + hot) * 0.4 / -np.log(0.6), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["pile_up.detections=0.3"], "name them: effects=.pile_up."),
+        (["effects=[pile_up]", "pile_up.detections=lots"], "must be a number; found 'lots'"),
+        (["effects=pileup"], "no effect 'pileup'"),
+        (["effects=[pile_up]", "irf_tail.fraction=0.3"], "not among effects"),
+        (["exposure=0"], "exposure must be above 0"),
+    ],
+)
+def test_effects_that_make_no_sense_are_one_sentence(arguments, words, tmp_path, capsys):
+    out = tmp_path / "a.hdf5"
+    with pytest.raises(SystemExit) as end:
+        simulate.main([f"out={out}", *SMALL, *arguments])
+    assert end.value.code == 2
+    assert re.search(words, capsys.readouterr().err)
+    assert not out.exists()
 
 
 def test_keeps_what_is_already_there(tmp_path, capsys):
