@@ -20,7 +20,7 @@ from nlos_lit.effects.scan import Scan
 from nlos_lit.surfel_fit import SurfelFit
 
 log = logging.getLogger(__name__)
-WORK = 2e12  # multiplications of the nuisance columns with each other, half a minute of one core
+WORK = 1e12  # multiplications of the nuisance columns with each other, some 40 s of one core
 WELL = 0.01  # retained information from which on an effect counts as well identifiable
 Tell = Callable[[str], None]
 Rebuild = Callable[[Extension], SurfelFit]
