@@ -1,0 +1,211 @@
+"""Parameters of accepted effects and their errors, against dense algebra and by hand; what the diagnosis makes of them."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, scattered, surfels
+from torch import Tensor
+
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.criticism.diagnosis import _screened, judge
+from nlos_lit.criticism.discrepancy import Discrepancy
+from nlos_lit.criticism.estimate import Uncertainty, polish
+from nlos_lit.criticism.refit import Comparison
+from nlos_lit.criticism.screen import Candidate
+from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
+from nlos_lit.criticism.toys import Null
+from nlos_lit.effects import Effect, Extension, Scan
+from nlos_lit.surfel_fit import SurfelFit
+
+SCAN = Scan.of(capture_of(scattered(12)))
+
+
+def known(effects: list[Effect], covariance: Tensor, step: Tensor | None = None) -> Uncertainty:
+    found = object.__new__(Uncertainty)
+    found.effects, found.covariance, found.step = effects, covariance.double(), step
+    return found
+
+
+def test_delta_method_by_hand():
+    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01 raw}: slope 0.01 P."""
+    ripple = effect_of("tcspc_nonlinearity", SCAN, sine=0.06, cosine=0.08, period=10.0)
+    slope = effect_of("background_slope", SCAN, slope=0.2)
+    covariance = torch.diag(torch.tensor([9.0, 1.0, 4.0, 0.25]))
+    covariance[1, 2] = covariance[2, 1] = -1.0
+    found = known([slope, ripple], covariance).parameters(ripple)
+    variance = 0.02**2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
+    assert found["amplitude"].value == pytest.approx(0.1, rel=1e-3)
+    assert found["amplitude"].stderr == pytest.approx(variance**0.5, rel=1e-3)
+    assert found["period"].stderr == pytest.approx(0.01 * 10 * 0.5, rel=1e-4)
+    assert (found["amplitude"].unit, found["period"].unit) == ("1", "bins")
+    own = known([slope, ripple], covariance).parameters(slope)
+    assert own["slope"].value == pytest.approx(0.2)
+    assert own["slope"].stderr == pytest.approx(0.05 * 3)
+
+
+def test_a_width_is_as_certain_as_its_spots_are_many():
+    """Jitter of 8 solved spots of 12: σ/√16."""
+    offset = torch.zeros(12)
+    offset[:8] = 0.01 * torch.tensor([1.0, -1, 1, -1, 1, -1, 1, -1])
+    jitter = effect_of("timing_jitter", SCAN, offset=offset)
+    sigma = 0.01 * (8 / 12) ** 0.5
+    found = known([], torch.zeros(0, 0)).parameters(jitter)["sigma"]
+    assert found.value == pytest.approx(sigma, rel=1e-3)
+    assert found.stderr == pytest.approx(sigma / 4, rel=1e-3)
+
+
+def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, Tensor, Tensor]:
+    """64 spots in 16 blocks with a gain and pile-up at their true values; counts drawn, or exactly expected with no seed."""
+    scene = capture_of(raster(8))
+    model, scan = surfels(scene, level=40.0), Scan.of(scene)
+    extension = Extension([effect_of("vignetting", scan, strength=0.3), effect_of("pile_up", scan, detections=0.3)])
+    spots, block = torch.arange(64), torch.arange(64) // 16 * 4 + torch.arange(64) % 8 // 2
+    patches = 1 + factor * torch.from_numpy(np.random.default_rng(9).standard_normal(16)).float()[block][:, None]
+    measured = drawn(model, extension, scene, seed or 0, patches if factor != 1.0 else 1.0)
+    fit = fit_of(model, measured, extension)
+    if seed is None:
+        fit.counts = model.expected(spots, extension)
+    return fit, spots, block
+
+
+def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Effects' block of the inverse of the whole information matrix; projected columns; residuals. Of nuisance and effects at once."""
+    problem = build_problem(fit.model, fit.extension, spots, fit.counts, with_effects=False)
+    z = torch.cat([weighted_columns(problem, e) for e in fit.extension.effects], 1).double()
+    x = problem.nuisance.double()
+    both = torch.cat([x, z], 1)
+    information = both.T @ both
+    information += torch.diag(torch.cat([problem.prior.double(), torch.zeros(2)]))
+    inverse = torch.linalg.inv(information)[-2:, -2:]
+    lean = torch.linalg.solve(information[:-2, :-2], x.T @ torch.cat([z, problem.residual.double()[:, None]], 1))
+    off = torch.cat([z, problem.residual.double()[:, None]], 1) - x @ lean
+    return inverse, off[:, :2], off[:, 2]
+
+
+@FORWARD_MODE
+def test_covariance_is_the_inverse_of_the_whole_information():
+    fit, spots, block = accepted_fit(seed=None)
+    found = Uncertainty(fit, spots, fit.counts, block)
+    inverse, _, _ = dense(fit, spots)
+    assert torch.allclose(found.covariance, inverse, rtol=2e-3)
+    assert float(found.step.abs().max()) < 1e-3
+    estimate = found.parameters(fit.extension.effects[1])["detections"]
+    assert estimate.value == pytest.approx(0.3, rel=1e-5)
+    assert estimate.stderr == pytest.approx(0.05 * float(inverse[1, 1]) ** 0.5, rel=1e-3)
+
+
+@FORWARD_MODE
+def test_misfit_between_blocks_widens_the_errors():
+    """Huber's sandwich on counts whose patches are brighter and darker than the model."""
+    fit, spots, block = accepted_fit(factor=0.1)
+    found = Uncertainty(fit, spots, fit.counts, block)
+    inverse, z, residual = dense(fit, spots)
+    by_block = torch.stack([(z * residual[:, None]).view(64, -1, 2)[block == b].sum((0, 1)) for b in range(16)])
+    robust = inverse @ (by_block.T @ by_block) @ inverse
+    grown = (robust.diagonal() / inverse.diagonal()).clamp_min(1).sqrt()
+    assert float(grown.max()) > 2
+    assert torch.allclose(found.covariance, inverse * grown[:, None] * grown[None], rtol=0.02)
+    calm, _, _ = accepted_fit()
+    assert torch.all(Uncertainty(calm, spots, calm.counts, block).covariance.diagonal() < 2.5 * inverse.diagonal())
+
+
+@FORWARD_MODE
+def test_errors_are_those_of_repeated_measurements():
+    """Two hundred draws of counts: one-step estimates scatter as the reported errors say, around the truth."""
+    fit, spots, block = accepted_fit(seed=None)
+    found = Uncertainty(fit, spots, fit.counts, block)
+    _, z, _ = dense(fit, spots)
+    expected = fit.counts.double()
+    drawn_counts = np.random.default_rng(1).poisson(expected.numpy(), (200, *expected.shape))
+    residuals = torch.from_numpy((drawn_counts - expected.numpy()) / np.sqrt(expected.numpy())).reshape(200, -1)
+    steps = residuals @ z @ torch.linalg.inv(z.T @ z)
+    error = found.covariance.diagonal().sqrt()
+    assert torch.all((steps.std(0) / error - 1).abs() < 4 / 400**0.5)
+    assert torch.all(steps.mean(0).abs() < 4 * error / 200**0.5)
+
+
+@FORWARD_MODE
+def test_polish_takes_the_last_step_and_no_more():
+    """Started a little off, one Newton step arrives; a step is three standard errors long at most."""
+    fit, spots, block = accepted_fit(seed=None)
+    vignetting, pile_up = fit.extension.effects
+    vignetting.set("strength", 0.298)
+    uncertainty = Uncertainty(fit, spots, fit.counts, block)
+    polish(fit, uncertainty, most=1e6)
+    assert vignetting.value("strength").item() == pytest.approx(0.3, abs=2e-4)
+    assert pile_up.value("detections").item() == pytest.approx(0.3, abs=2e-3)
+    before = vignetting.value("strength").item()
+    limited = known(list(fit.extension.effects), torch.diag(torch.tensor([0.04, 0.01])), torch.tensor([5.0, -0.1]).double())
+    polish(fit, limited)
+    assert vignetting.value("strength").item() - before == pytest.approx(0.05 * 3 * 0.2, rel=1e-4)
+    assert pile_up.value("detections").item() == pytest.approx(0.3 - 0.05 * 0.1, abs=2e-3)
+
+
+def findings(gains: list[float], left: list[Discrepancy]) -> Findings:
+    """Effects accepted with ``gains`` nats on 64 select spots, what is left, and a small fit."""
+    names = ["irf_tail", "pile_up"][: len(gains)]
+    effects = [effect_of(n, SCAN) for n in names]
+    final = SimpleNamespace(extension=Extension(effects), model=range(12), counts=torch.zeros(160, 58))
+    turns = [
+        Turn([], [], [], Trial(Candidate(e, 0, 0, 0, 0, None, None, {}, None), None, Comparison(g, 1, (0, 0)), None), [])
+        for e, g in zip(effects, gains, strict=True)
+    ]
+    return Findings(final, final, [*turns, Turn([], left, [], None, [])])
+
+
+SPLIT = SimpleNamespace(fit=np.arange(160), select=np.arange(64))
+
+
+def discrepancy(axis: str, gain: float, p: float = 1e-9) -> Discrepancy:
+    return Discrepancy(axis, gain, 2 * gain, 40, p)
+
+
+def test_what_is_left_is_flagged_or_not():
+    calm = [discrepancy("time", 20), discrepancy("wall", 3), discrepancy("scan", 90, p=3e-4), discrepancy("rate", -5)]
+    said = judge(findings([], calm), SPLIT, CriticismSettings())
+    assert not said.unexplained.significant  # time gains too little; scan's p-value is 1.2e-3 over four axes
+    assert said.unexplained.axis == "scan"
+    loud = [discrepancy("time", 30), discrepancy("wall", 200), *calm[2:]]
+    said = judge(findings([], loud), SPLIT, CriticismSettings())
+    assert said.unexplained.significant
+    assert (said.unexplained.axis, said.unexplained.statistic) == ("wall", 400)
+    assert not said.dominates, "nothing was named"
+
+
+def test_names_fall_where_more_is_left_than_they_explain():
+    """32 + 32 nats on 64 select spots are one a spot; of 160 tested ones 150 nats are left, or 170."""
+    for gain, dominates in ((150, False), (170, True)):
+        said = judge(findings([32.0, 32.0], [discrepancy("time", gain)]), SPLIT, CriticismSettings())
+        assert said.unexplained.significant
+        assert said.dominates is dominates
+    # Half as many spots tested: what is left counts twice.
+    assert judge(findings([32.0, 32.0], [discrepancy("time", 90)]), SPLIT, CriticismSettings(spots=80)).dominates
+    # Names must explain three quarters: three times as much.
+    assert judge(findings([32.0, 32.0], [discrepancy("time", 60)]), SPLIT, CriticismSettings(explained=0.75)).dominates
+
+
+def test_screened_in_units_of_the_parameters():
+    tail = effect_of("irf_tail", SCAN, decay=0.11)
+    found = _screened(Candidate(tail, 30.0, 1e-6, 0.4, 12.0, torch.tensor([2.0]), torch.tensor([0.3]), {"decay": 0.11}, None), None)
+    assert found.one_step["fraction"] == pytest.approx(0.1)
+    assert found.detectable["fraction"] == pytest.approx(5 * 0.05 * 0.3)  # statistic 25 = five standard errors
+    assert (found.degrees, found.shape) == (1, {"decay": 0.11})
+    retro = effect_of("retroreflection", SCAN)
+    found = _screened(Candidate(retro, 9.0, 0.1, 0.4, 1.0, torch.tensor([-1.0, 0.5]), torch.ones(2), {}, None), None)
+    scale = {p.name: p.scale for p in retro.amplitudes}
+    assert found.one_step == pytest.approx({"falloff": 4 - scale["falloff"], "cosine": 1 + 0.5 * scale["cosine"]})
+    drift = effect_of("power_drift", SCAN)
+    null = Null(4, {"power_drift": 2.0}, [])
+    candidate = Candidate(drift, 30.0, 1e-6, 0.4, 12.0, torch.tensor([1.0, 2, 0, 2, 0]), torch.full((5,), 0.2), {}, None)
+    found = _screened(candidate, null)
+    assert found.one_step["drift"] == pytest.approx(0.05 * (9 / 5) ** 0.5)
+    assert found.p_value == pytest.approx(null.p_value(candidate))
+    hot = effect_of("hot_spots", SCAN)
+    error = torch.tensor([float("nan"), 2.0, 2.0])
+    found = _screened(Candidate(hot, 9.0, 0.1, 1.0, 1.0, torch.zeros(3), error, {}, None), None)
+    assert (found.degrees, found.one_step) == (2, {})
+    assert found.detectable["extra"] == pytest.approx(5 * hot.declared["extra"].scale * 2)
