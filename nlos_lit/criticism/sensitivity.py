@@ -36,7 +36,7 @@ class Problem:
     Args:
         spots: ``[S]``, one row block of ``bins`` rows each. expected: ``[S, bins]`` μ.
         nuisance: ``[S·bins, P]`` X. prior: ``[P]`` precision of each nuisance column's coefficient.
-        residual: ``[S·bins]``.
+        residual: ``[S·bins]``. transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
     """
 
     model: SurfelModel
@@ -47,6 +47,7 @@ class Problem:
     nuisance: Tensor
     prior: Tensor
     residual: Tensor
+    transients: Tensor
 
     @property
     def bins(self) -> int:
@@ -63,38 +64,39 @@ def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, count
     m = len(model)
     tilts = _tilt_fields(model)
     size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
-    surfels, others = [], []
-    response = {f"model.laser_sensor.{n}": p for n, p in model.laser_sensor.named_parameters()}
-    accepted = {
-        f"extension.effects.{i}.{n}": p
-        for i, e in enumerate(extension.effects)
-        for n, p in e.named_parameters()
-        if with_effects and not e.per_spot
-    }
+    surfels, others, light = [], [], []
+    response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
-        jacobian = _record_jacobian(model, extension, part)
-        columns = _transient_columns(model, extension, part, tilts)
-        surfels.append(torch.bmm(jacobian, columns).flatten(0, 1))
-        del columns
-        both = [
-            _tangent(model, extension, part, {name: (p, k)})[:, model.gate[0] :]
-            for name, p in (response | accepted).items()
-            for k in range(p.numel())
-        ]
+        with torch.no_grad():
+            light.append(model.transients(model.paths(part), part, extension))
+        surfels.append(_surfel_columns(model, extension, part, light[-1], tilts))
+        forward = _recording(model, extension, part, light[-1])
+        both = [_jvp(forward, name, p, torch.ones_like(p))[:, model.gate[0] :] for name, p in response.items()]
         others.append(torch.stack(both, -1).flatten(0, 1))
-    nuisance = torch.cat([torch.cat(surfels), torch.cat(others)], 1)
+    transients = torch.cat(light)
+    accepted = [e for e in extension.effects if with_effects and not e.per_spot]
+    more = [effect_columns(model, extension, spots, e, shapes=True, transients=transients) for e in accepted]
+    nuisance = torch.cat([torch.cat(surfels), torch.cat(others), *more], 1)
     weight = expected.reshape(-1).rsqrt()
     nuisance *= weight[:, None]
     residual = (counts - expected).reshape(-1) * weight
     prior = torch.zeros(nuisance.shape[1])
     prior[2 * m : 2 * m + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
-    return Problem(model, extension, spots, counts, expected, nuisance, prior, residual)
+    return Problem(model, extension, spots, counts, expected, nuisance, prior, residual, transients)
 
 
-def effect_columns(model: SurfelModel, extension: Extension, spots: Tensor, effect: Effect, shapes: bool = False) -> Tensor:
+def effect_columns(
+    model: SurfelModel,
+    extension: Extension,
+    spots: Tensor,
+    effect: Effect,
+    shapes: bool = False,
+    transients: Tensor | None = None,
+) -> Tensor:
     """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the extension.
 
     ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every spot's own.
+    ``transients``: ``[S, T]`` of these spots, where they are known already.
     """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
@@ -102,8 +104,10 @@ def effect_columns(model: SurfelModel, extension: Extension, spots: Tensor, effe
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
     names = [(f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted]
     parts = []
-    for part in spots.split(_path_batch(model) if effect.needs_paths else 256):
-        forward = _staged(model, whole, effect, part)
+    size = _path_batch(model) if effect.needs_paths or transients is None else 256
+    for start in range(0, len(spots), size):
+        part = spots[start : start + size]
+        forward = _staged(model, whole, effect, part, None if transients is None else transients[start : start + size])
         columns = []
         for name, raw, number in names:
             for k in range(1 if effect.per_spot else number):
@@ -116,7 +120,7 @@ def effect_columns(model: SurfelModel, extension: Extension, spots: Tensor, effe
 
 def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
     """:func:`effect_columns` of a problem's spots, divided by √μ."""
-    columns = effect_columns(problem.model, problem.extension, problem.spots, effect, shapes)
+    columns = effect_columns(problem.model, problem.extension, problem.spots, effect, shapes, problem.transients)
     return columns * problem.expected.reshape(-1, 1).rsqrt()
 
 
@@ -145,14 +149,17 @@ def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor
 
 
 @torch.no_grad()
-def _staged(model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor) -> _Forward:
+def _staged(
+    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None
+) -> _Forward:
     """The part of the forward model that comes after what ``effect`` cannot change, with the part before worked out."""
-    paths = model.paths(spots)
     if effect.needs_paths:
+        paths = model.paths(spots)
         return _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
-    transients = model.transients(paths, spots, extension)
+    if transients is None:
+        transients = model.transients(model.paths(spots), spots, extension)
     if effect.stage == "response":
-        return _Forward(model, extension, lambda m, e: m.record(transients, spots, e))
+        return _recording(model, extension, spots, transients)
     signal = model.signal(transients, extension)
     if effect.stage == "spot":
         return _Forward(model, extension, lambda m, e: m.detect(signal, spots, e))
@@ -160,21 +167,19 @@ def _staged(model: SurfelModel, extension: Extension, effect: Effect, spots: Ten
     return _Forward(model, extension, lambda m, e: e.counting(light, spots))
 
 
-def _tangent(model: SurfelModel, extension: Extension, spots: Tensor, which: dict[str, tuple[Tensor, int]]) -> Tensor:
-    """``[B, T]`` derivative of the expected counts by element k of a parameter of response or accepted effects."""
-    ((name, (value, k)),) = which.items()
-    with torch.no_grad():
-        paths = model.paths(spots)
-    forward = _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
-    tangent = torch.zeros_like(value)
-    tangent.view(-1)[k] = 1.0
-    return _jvp(forward, name, value, tangent)
+def _recording(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> _Forward:
+    return _Forward(model, extension, lambda m, e: m.record(transients, spots, e))
+
+
+def _surfel_columns(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor, tilts: Tensor) -> Tensor:
+    """``[B·T_gate, P]`` derivatives of the expected counts by all surfels' parameters."""
+    jacobian = _record_jacobian(model, extension, spots, transients)
+    return torch.bmm(jacobian, _transient_columns(model, extension, spots, tilts)).flatten(0, 1)
 
 
 @torch.no_grad()
-def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor) -> Tensor:
+def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
     """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), exact for any response, gain and counting stage."""
-    transients = model.transients(model.paths(spots), spots, extension)
     b, t = transients.shape
     repeated, again = transients.repeat_interleave(t, 0), spots.repeat_interleave(t)
     unit = torch.eye(t).repeat(b, 1)
