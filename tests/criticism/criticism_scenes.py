@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture import Capture
+from nlos_lit.criticism.sensitivity import Problem
 from nlos_lit.effects import EFFECTS, Effect, Extension, Scan
 from nlos_lit.parameters import BoundedParameter
 from nlos_lit.surfel_fit import RefineSettings, SurfelFit
@@ -112,6 +114,14 @@ def drawn(model: SurfelModel, extension: Extension, scene: Capture, seed: int = 
         counts, scene.laser, scene.sensor, scene.laser_normal, scene.sensor_normal, bin_length=scene.bin_length,
         t_start=scene.t_start, gate=scene.gate, scan_order=scene.scan_order,
     )  # fmt: skip
+
+
+def problem_of(spots: Tensor, expected: Tensor, nuisance: Tensor, residual: Tensor, prior: Tensor | None = None) -> Problem:
+    """A least-squares problem without a model behind it."""
+    prior = torch.zeros(nuisance.shape[1]) if prior is None else prior
+    given = {"extension": Extension([]), "spots": spots, "counts": expected, "expected": expected}
+    given |= {"nuisance": nuisance, "residual": residual, "prior": prior}
+    return Problem(**{f.name: given.get(f.name) for f in dataclasses.fields(Problem)})
 
 
 def fit_of(model: SurfelModel, scene: Capture, extension: Extension | None = None, train: np.ndarray | None = None) -> SurfelFit:

@@ -73,7 +73,7 @@ def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, 
 
 
 def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Effects' block of the inverse of the whole information matrix; projected columns; residuals. Of nuisance and effects at once."""
+    """Effects' block of the inverse of the whole information matrix; their columns and the residual off the nuisance."""
     problem = build_problem(fit.model, fit.extension, spots, fit.counts, with_effects=False)
     z = torch.cat([weighted_columns(problem, e) for e in fit.extension.effects], 1).double()
     x = problem.nuisance.double()

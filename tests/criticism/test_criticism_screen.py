@@ -8,14 +8,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 import torch
-from criticism_scenes import capture_of, effect_of, scattered
+from criticism_scenes import capture_of, effect_of, problem_of, scattered
 from scipy import stats
 from torch import Tensor
 
 from nlos_lit.criticism import screen as screening
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem
-from nlos_lit.effects import Effect, Extension, Scan
+from nlos_lit.effects import Effect, Scan
 
 SPOTS, BINS, DRAWS = 42, 6, 200
 ROWS = SPOTS * BINS
@@ -28,9 +28,7 @@ def normal(*shape: int, seed: int) -> Tensor:
 
 def problem(residual: Tensor, nuisance: Tensor | None = None, prior: Tensor | None = None) -> Problem:
     x = normal(ROWS, 7, seed=1) if nuisance is None else nuisance
-    prior = torch.zeros(x.shape[1]) if prior is None else prior
-    flat = torch.ones(SPOTS, BINS)
-    return Problem(None, Extension([]), torch.arange(SPOTS), flat, flat, x, prior, residual)
+    return problem_of(torch.arange(SPOTS), torch.ones(SPOTS, BINS), x, residual, prior)
 
 
 def columns(effect: Effect, strength: float = 10.0) -> Tensor:
@@ -47,7 +45,7 @@ def own_columns(k: int, seed: int) -> Tensor:
 
 @pytest.fixture(autouse=True)
 def _known_columns(monkeypatch):
-    monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect: columns(effect))
+    monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect, *_, **__: columns(effect))
 
 
 FOLD = torch.arange(SPOTS) % FOLDS
@@ -162,7 +160,9 @@ def test_amplitudes_stay_in_their_bounds():
 
 def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
-    monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect: ripple(float(effect.value("period").detach())))
+    monkeypatch.setattr(
+        screening, "weighted_columns", lambda problem, effect, *_, **__: ripple(float(effect.value("period").detach()))
+    )
     grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
     assert len(grid) > 2 * screening.KEPT
     period = grid[29]["period"]
@@ -193,7 +193,7 @@ def test_screening_ranks_by_gain():
 
 def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     """Column 1 at every bin of a spot, F = 6 a spot: δ ~ N(0, 1.5²) is seen as an excess of scatter, and no scatter as none."""
-    monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect: torch.ones(ROWS, 1))
+    monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
     delta = 1.5 * normal(SPOTS, seed=12)
     truth = delta.repeat_interleave(BINS)
     nuisance = torch.zeros(ROWS, 1)

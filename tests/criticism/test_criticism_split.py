@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from criticism_scenes import FORWARD_MODE, GATE, capture_of, drawn, raster, scattered, surfels
+from criticism_scenes import FORWARD_MODE, GATE, capture_of, drawn, problem_of, raster, scattered, surfels
 from scipy import ndimage
 
 from nlos_lit.criticism.discrepancy import BANDS, bands, discrepancies
@@ -127,7 +127,7 @@ def test_a_misfit_is_seen_on_its_axis(scene, axis):
 def test_bands_by_hand():
     scene = capture_of(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.49, 0.26]]), scan_order=np.array([3, 0, 1, 2]))
     expected = torch.tensor([[2.0] * 80, [1.0] * 80, [4.0] * 80, [3.0] * 80])
-    problem = Problem(None, Extension([]), torch.tensor([3, 0, 1, 2]), expected, expected, expected, expected, expected)
+    problem = problem_of(torch.tensor([3, 0, 1, 2]), expected, expected, expected)
     scan = Scan.of(scene)
     assert bands(problem, "wall", scan).tolist() == [3 * 8 + 2, 0, 7 * 8, 7]
     assert bands(problem, "scan", scan).tolist() == [42, 63, 0, 21]  # ranks 2/3, 1, 0, 1/3 of 64
@@ -139,6 +139,6 @@ def test_bands_by_hand():
 def test_bands_follow_irregular_spots():
     scene = capture_of(scattered(50))
     flat = torch.ones(50, 58)
-    problem = Problem(None, Extension([]), torch.arange(50), flat, flat, flat, flat, flat)
+    problem = problem_of(torch.arange(50), flat, flat, flat)
     band = bands(problem, "wall", Scan.of(scene))
     assert 0 <= int(band.min()) <= int(band.max()) < 64
