@@ -68,5 +68,5 @@ def main(config: DictConfig) -> None:
 
 if __name__ == "__main__":
     quote_numbers(sys.argv)
-    refuse_finished_folder(sys.argv[1:])
+    refuse_finished_folder(sys.argv[1:], diagnosis=True)
     main()

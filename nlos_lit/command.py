@@ -30,10 +30,16 @@ def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
     return wrapped
 
 
-def refuse_finished_folder(arguments: list[str]) -> None:
-    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and nothing is resumed."""
+def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> None:
+    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and nothing is resumed.
+
+    ``diagnosis``: also when it holds a diagnosis.
+    """
     given = dict(item.split("=", 1) for item in arguments if "=" in item)
     folder = given.get("hydra.run.dir")
+    if diagnosis and folder is not None and (Path(folder) / "diagnosis" / "diagnosis.json").exists():
+        print(f"error: {folder} already holds a diagnosis; choose another hydra.run.dir", file=sys.stderr)
+        sys.exit(2)
     if folder is not None and (Path(folder) / "summary.json").exists() and "ckpt_path" not in given:
         print(
             f"error: {folder} already holds a finished run (summary.json); choose another hydra.run.dir, "
