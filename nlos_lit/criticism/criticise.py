@@ -213,7 +213,7 @@ def choose(trials: list[Trial], block: np.ndarray) -> Trial:
         short = compare(trial.likelihood, best.likelihood, block)
         return short.nats < max(short.error, 0.02 * best.gain.nats)
 
-    near = [t for t in trials if close(t)]
+    near = [t for t in trials if t is best or close(t)]
     return min(near, key=lambda t: (len(t.candidate.step) if not t.candidate.effect.per_spot else 2, -t.gain.nats))
 
 

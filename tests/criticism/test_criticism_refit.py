@@ -121,6 +121,12 @@ def test_fewest_parameters_win_a_tie():
     assert choose([wide, jitter, replace(near, likelihood=best - 1)], BLOCK) is jitter
 
 
+def test_the_best_of_bad_rivals_is_chosen():
+    """None gains anything, as can happen where a base is far off: it is the caller's to refuse."""
+    worst, bad = (trial(n, per_spot(0, 0.5) - k, -120.0 * k) for n, k in (("irf_tail", 2), ("occlusion", 1)))
+    assert choose([bad, worst], BLOCK) is bad
+
+
 def test_group_has_what_the_capture_cannot_tell_apart():
     best = trial("irf_tail", per_spot(2.0, 0.5), 240)
     same = trial("afterpulsing", best.likelihood - per_spot(0.02, 0.1, seed=1), 237.6, direction=torch.tensor([1.0, 0, 0, 0]))
