@@ -21,8 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind"), str(ROOT / "benchmarks
 STORE = ROOT / "benchmarks" / "results" / "blind"
 SHARES = {"null": 0.42, "single": 0.38, "pair": 0.08, "unknown": 0.12}
 MARK = "<!-- measured: python benchmarks/blind.py report -->"
-SIMPLE = ("default", "letters", "z_confocal", "corner")
-SCENES = ("default", "letters", "sphere_before_plate", "z_confocal")
+SCENES = ("default", "letters", "z_confocal")
 
 
 def table(count: int) -> dict[str, object]:
@@ -34,8 +33,7 @@ def table(count: int) -> dict[str, object]:
         kind = min(SHARES, key=lambda name: (done[name] + 1) / SHARES[name])
         done[kind] += 1
         strengths = (1, 2, 3) if kind in ("pair", "unknown") else (0, 1, 2, 3)
-        scenes = SCENES if kind == "null" else SIMPLE
-        specs[f"{k:03d}_{kind}"] = draw_spec(1000 + k, kind, scenes=scenes, strengths=strengths, levels=LEVELS)
+        specs[f"{k:03d}_{kind}"] = draw_spec(1000 + k, kind, scenes=SCENES, strengths=strengths, levels=LEVELS)
     return specs
 
 

@@ -10,7 +10,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_spots
-from nlos_lit.criticism.estimate import Uncertainty, polish
+from nlos_lit.criticism.estimate import Uncertainty
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import profiles
 from nlos_lit.criticism.result import Accepted, Diagnosis, Gain, Screened, Unexplained
@@ -66,8 +66,6 @@ def assemble(
     base, final = found.base, found.final
     spots = torch.from_numpy(split.fit)
     block = torch.from_numpy(split.block[split.fit])
-    if found.accepted:
-        polish(final, Uncertainty(final, spots, final.counts, block))
     uncertainty = Uncertainty(final, spots, final.counts, block)
     verdicts = judge(found, split, settings)
     effects, groups = [], []

@@ -32,7 +32,6 @@ class Uncertainty:
         by_spot = (z * projector.residual[:, None]).view(len(spots), -1, z.shape[1]).sum(1).double()
         names, index = torch.unique(block, return_inverse=True)
         by_block = torch.zeros(len(names), z.shape[1], dtype=torch.float64).index_add_(0, index, by_spot)
-        self.step = inverse @ by_spot.sum(0)
         robust = inverse @ (by_block.T @ by_block) @ inverse
         grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
         self.covariance = inverse * grow[:, None] * grow[None, :]
@@ -64,16 +63,3 @@ def _spread(effect: Effect) -> dict[str, Estimate]:
         name: Estimate(float(q.value.detach()), float(q.value.detach()) / (2 * fitted) ** 0.5, q.unit)
         for name, q in effect.quantities().items()
     }
-
-
-def polish(fit: SurfelFit, uncertainty: Uncertainty, most: float = 3.0) -> None:
-    """One Newton step of the effects' parameters, each at most ``most`` standard errors: takes out what the optimiser left."""
-    start = 0
-    for effect in uncertainty.effects:
-        for p in [*effect.amplitudes, *effect.shapes]:
-            part = slice(start, start + p.size)
-            limit = most * uncertainty.covariance.diagonal()[part].sqrt()
-            with torch.no_grad():
-                getattr(effect, f"raw_{p.name}").add_(uncertainty.step[part].clamp(-limit, limit).float())
-            start += p.size
-        effect.clamp()

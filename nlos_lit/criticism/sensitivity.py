@@ -149,9 +149,7 @@ def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor
 
 
 @torch.no_grad()
-def _staged(
-    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None
-) -> _Forward:
+def _staged(model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None) -> _Forward:
     """The part of the forward model that comes after what ``effect`` cannot change, with the part before worked out."""
     if effect.needs_paths:
         paths = model.paths(spots)

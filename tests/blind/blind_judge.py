@@ -91,9 +91,11 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         truth = make_capture(spec, path)
         diagnosis, found, capture = diagnose_file(path, options)
     split = split_spots(capture)
-    before = control_likelihood(found.base, split, options.steps, 0)
-    gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
-    best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else 0.0
+    gain = best = 0.0
+    if oracle and (truth.names or diagnosis.effects):
+        before = control_likelihood(found.base, split, options.steps, 0)
+        gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
+        best = oracle_gain(truth, found, capture, options, before) if truth.names else 0.0
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,

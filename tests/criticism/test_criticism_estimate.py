@@ -13,7 +13,7 @@ from torch import Tensor
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn
 from nlos_lit.criticism.diagnosis import _screened, judge
 from nlos_lit.criticism.discrepancy import Discrepancy
-from nlos_lit.criticism.estimate import Uncertainty, polish
+from nlos_lit.criticism.estimate import Uncertainty
 from nlos_lit.criticism.refit import Comparison
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
@@ -126,23 +126,6 @@ def test_errors_are_those_of_repeated_measurements():
     error = found.covariance.diagonal().sqrt()
     assert torch.all((steps.std(0) / error - 1).abs() < 4 / 400**0.5)
     assert torch.all(steps.mean(0).abs() < 4 * error / 200**0.5)
-
-
-@FORWARD_MODE
-def test_polish_takes_the_last_step_and_no_more():
-    """Started a little off, one Newton step arrives; a step is three standard errors long at most."""
-    fit, spots, block = accepted_fit(seed=None)
-    vignetting, pile_up = fit.extension.effects
-    vignetting.set("strength", 0.298)
-    uncertainty = Uncertainty(fit, spots, fit.counts, block)
-    polish(fit, uncertainty, most=1e6)
-    assert vignetting.value("strength").item() == pytest.approx(0.3, abs=2e-4)
-    assert pile_up.value("detections").item() == pytest.approx(0.3, abs=2e-3)
-    before = vignetting.value("strength").item()
-    limited = known(list(fit.extension.effects), torch.diag(torch.tensor([0.04, 0.01])), torch.tensor([5.0, -0.1]).double())
-    polish(fit, limited)
-    assert vignetting.value("strength").item() - before == pytest.approx(0.05 * 3 * 0.2, rel=1e-4)
-    assert pile_up.value("detections").item() == pytest.approx(0.3 - 0.05 * 0.1, abs=2e-3)
 
 
 def findings(gains: list[float], left: list[Discrepancy]) -> Findings:
