@@ -127,7 +127,7 @@ class SurfelFit:
     def run(
         self, rounds: int, progress: Progress | None = None, grow_first: bool = False, steps: int | None = None, settle: bool = True
     ) -> list[dict[str, float]]:
-        """``rounds`` rounds of ``steps`` batches (default: the settings'), the last twice as long; surfels die and grow between them.
+        """``rounds`` rounds of ``steps`` batches (None: as set), the last twice as long; surfels die and grow between.
 
         ``settle``: the first round comes from seeds, and the response waits for their places.
         Returns one entry a round: surfels, mean loss over its last quarter, response.

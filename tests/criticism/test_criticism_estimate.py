@@ -24,9 +24,9 @@ from nlos_lit.surfel_fit import SurfelFit
 SCAN = Scan.of(capture_of(scattered(12)))
 
 
-def known(effects: list[Effect], covariance: Tensor, step: Tensor | None = None) -> Uncertainty:
+def known(effects: list[Effect], covariance: Tensor) -> Uncertainty:
     found = object.__new__(Uncertainty)
-    found.effects, found.covariance, found.step = effects, covariance.double(), step
+    found.effects, found.covariance = effects, covariance.double()
     return found
 
 
@@ -92,7 +92,6 @@ def test_covariance_is_the_inverse_of_the_whole_information():
     found = Uncertainty(fit, spots, fit.counts, block)
     inverse, _, _ = dense(fit, spots)
     assert torch.allclose(found.covariance, inverse, rtol=2e-3)
-    assert float(found.step.abs().max()) < 1e-3
     estimate = found.parameters(fit.extension.effects[1])["detections"]
     assert estimate.value == pytest.approx(0.3, rel=1e-5)
     assert estimate.stderr == pytest.approx(0.05 * float(inverse[1, 1]) ** 0.5, rel=1e-3)
