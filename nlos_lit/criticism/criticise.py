@@ -55,7 +55,7 @@ class CriticismSettings:
     similar: float = 0.9
     steps: int = 60
     most: int = 5
-    explained: float = 0.5
+    explained: float = 0.67
     numerics: bool = True
     toys: int = 0
     processes: int = 2
