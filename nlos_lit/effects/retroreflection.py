@@ -16,7 +16,8 @@ class Retroreflection(Effect):
     ``d1⁻² d2⁻² cosθ2 cosθ3 → (d1 d2)^{-falloff/2} d0^{falloff-4} (cosθ2 cosθ3)^cosine``, d0 half the path at the middle of the
     gate.
 
-    Parameters: ``falloff`` (1), null 4; 2 for a confocal retroreflector. ``cosine`` (1), null 1; 0 for one.
+    Parameters: ``falloff`` (1), null 4; 2 for a confocal retroreflector. ``cosine`` (1), null 1; 0 for one. Both may pass
+    the null by a little only: brighter near than a diffuse surface nothing is.
 
     Signature: with a large wall, a smooth map over wall positions and depths: far spots are too bright.
 
@@ -32,7 +33,7 @@ class Retroreflection(Effect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("falloff", "1", 4.0, 0.2, 1.0, 6.0), Parameter("cosine", "1", 1.0, 0.2, -0.5, 3.0))
+        return (Parameter("falloff", "1", 4.0, 0.2, 1.5, 4.2), Parameter("cosine", "1", 1.0, 0.2, -0.2, 1.2))
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         distance = paths.laser_leg * paths.sensor_leg / (self.scan.middle / 2) ** 2
