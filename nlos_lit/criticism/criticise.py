@@ -92,9 +92,14 @@ def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
     return min(most, len(split.fit), max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
 
 
+def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
+    """Rows of ``split.fit`` that are looked at."""
+    return np.sort(np.random.default_rng(seed).permutation(len(split.fit))[: tested_spots(fit, split, most)])
+
+
 def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[Problem, torch.Tensor]:
     """The weighted least-squares problem of tested spots, and their folds."""
-    rows = np.sort(np.random.default_rng(seed).permutation(len(split.fit))[: tested_spots(fit, split, most)])
+    rows = tested_rows(fit, split, most, seed)
     spots = torch.from_numpy(split.fit[rows])
     return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
 

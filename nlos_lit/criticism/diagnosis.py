@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
-from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_spots
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_rows, tested_spots
 from nlos_lit.criticism.estimate import Uncertainty
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import profiles
@@ -64,9 +64,10 @@ def assemble(
 ) -> Diagnosis:
     """Everything the report says."""
     base, final = found.base, found.final
-    spots = torch.from_numpy(split.fit)
-    block = torch.from_numpy(split.block[split.fit])
-    uncertainty = Uncertainty(final, spots, final.counts, block)
+    rows = tested_rows(final, split, settings.spots, seed)
+    spots = split.fit[rows]
+    counts, block = final.counts[rows], torch.from_numpy(split.block[spots])
+    uncertainty = Uncertainty(final, torch.from_numpy(spots), counts, block, len(rows) / len(split.fit))
     verdicts = judge(found, split, settings)
     effects, groups = [], []
     for turn in [] if verdicts.dominates else found.accepted:

@@ -17,9 +17,13 @@ class Uncertainty:
 
     The larger of two: F⁻¹ (counts alone) and F⁻¹(Σ_b s_b s_bᵀ)F⁻¹ (scatter of the score between wall blocks, which also feels
     misfit; Huber's sandwich).
+
+    Args:
+        spots: ``[S]`` fitted spots that are looked at, with gated ``counts`` and wall ``block``.
+        share: of all fitted spots that these are: the others have as much to say.
     """
 
-    def __init__(self, fit: SurfelFit, spots: Tensor, counts: Tensor, block: Tensor) -> None:
+    def __init__(self, fit: SurfelFit, spots: Tensor, counts: Tensor, block: Tensor, share: float = 1.0) -> None:
         self.effects = [e for e in fit.extension.effects if not e.per_spot]
         if not self.effects:
             return
@@ -34,7 +38,7 @@ class Uncertainty:
         by_block = torch.zeros(len(names), z.shape[1], dtype=torch.float64).index_add_(0, index, by_spot)
         robust = inverse @ (by_block.T @ by_block) @ inverse
         grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
-        self.covariance = inverse * grow[:, None] * grow[None, :]
+        self.covariance = share * inverse * grow[:, None] * grow[None, :]
 
     def parameters(self, effect: Effect) -> dict[str, Estimate]:
         """Reported quantities; errors by the delta method. The width of per-spot effects: from the number of spots."""
