@@ -10,13 +10,15 @@ import numpy as np
 import torch
 
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
-from nlos_lit.criticism.refit import Comparison, compare, copy_effects, log_likelihood, refit_with, score
+from nlos_lit.criticism.refit import compare, copy_effects, log_likelihood, refit_with, score
+from nlos_lit.criticism.rivals import Trial, best_of_each, choose, group_of
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import Split
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.scan import Scan
+from nlos_lit.errors import UserError
 from nlos_lit.surfel_fit import SurfelFit
 
 log = logging.getLogger(__name__)
@@ -59,20 +61,6 @@ class CriticismSettings:
     numerics: bool = True
     toys: int = 0
     processes: int = 2
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One rival after its refit: its gain on the select spots over a control that was refitted without it."""
-
-    candidate: Candidate
-    fit: SurfelFit
-    gain: Comparison
-    likelihood: torch.Tensor
-
-    @property
-    def name(self) -> str:
-        return self.candidate.effect.name
 
 
 @dataclass(frozen=True)
@@ -146,7 +134,10 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         finalists += [(c, copy_effects(fit.extension, [null_of(c.effect)])) for c in bending]
     for candidate, extension in finalists:
         tell(f"rebuilding the scene with {candidate.effect.name}")
-        trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
+        try:
+            trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
+        except UserError as error:  # with this effect no surfel survives: it is not the one
+            tell(f"{candidate.effect.name} leaves nothing: {error}")
     trials = best_of_each(trials)
     if not trials:
         return Turn(candidates, rest, [], None, [])
@@ -168,14 +159,6 @@ def null_of(effect: Effect) -> Effect:
     for p in copy.shapes:
         copy.set(p.name, effect.value(p.name).detach())
     return copy
-
-
-def best_of_each(trials: list[Trial]) -> list[Trial]:
-    """The better of an effect's trials, the largest gain first."""
-    found: dict[str, Trial] = {}
-    for trial in sorted(trials, key=lambda t: -t.gain.nats):
-        found.setdefault(trial.name, trial)
-    return list(found.values())
 
 
 def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
@@ -208,31 +191,6 @@ def significant(candidates: list[Candidate], s: CriticismSettings, over: float) 
             break
         passed.add(candidate.effect.name)
     return [c for c in candidates if c.effect.name in passed and c.gain > needed(c, s, over)]
-
-
-def choose(trials: list[Trial], block: np.ndarray) -> Trial:
-    """The best rival, or the one with fewest parameters among those that cannot be told from it (one standard error)."""
-    best = trials[0]
-
-    def close(trial: Trial) -> bool:
-        short = compare(trial.likelihood, best.likelihood, block)
-        return short.nats < max(short.error, 0.02 * best.gain.nats)
-
-    near = [t for t in trials if t is best or close(t)]
-    return min(near, key=lambda t: (len(t.candidate.step) if not t.candidate.effect.per_spot else 2, -t.gain.nats))
-
-
-def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float) -> list[str]:
-    """Names that this capture cannot tell from the best: as good after the refit, or the same sensitivity and nearly as good."""
-    names = []
-    for other in trials:
-        if other is best:
-            continue
-        short = compare(other.likelihood, best.likelihood, block)
-        alike = abs(float(other.candidate.direction @ best.candidate.direction)) > similar
-        if (alike and short.nats < 0.5 * best.gain.nats) or short.nats < max(2 * short.error, 0.02 * best.gain.nats):
-            names.append(other.name)
-    return names
 
 
 @dataclass

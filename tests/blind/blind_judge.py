@@ -92,10 +92,10 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         diagnosis, found, capture = diagnose_file(path, options)
     split = split_spots(capture)
     gain = best = 0.0
-    if oracle and (truth.names or diagnosis.effects):
+    if diagnosis.effects or (oracle and truth.names):
         before = control_likelihood(found.base, split, options.steps, 0)
         gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
-        best = oracle_gain(truth, found, capture, options, before) if truth.names else 0.0
+        best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else 0.0
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,
