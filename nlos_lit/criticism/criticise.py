@@ -108,10 +108,10 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     """
     tell("screening effects")
     candidates, rest = look(fit, split, scan, s, seed)
-    misfit, tested = excess(fit, split), tested_spots(fit, split, s.spots)
+    (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
     wanted = significant(candidates, s, over)
-    far_off = misfit > s.far_off * noise(fit, split)
+    far_off = misfit > s.far_off * noise
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
@@ -170,15 +170,11 @@ def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
     return max(s.least_gain * max(1.0, (WELL / max(candidate.retained, 1e-6)) ** 0.5), s.least_share * over)
 
 
-def noise(fit: SurfelFit, split: Split) -> float:
-    """Deviance that counts alone have, nats over as many spots as were fitted."""
-    return score(fit, split.select).deviance_noise / 2 * fit.counts.shape[1] * len(split.fit)
-
-
-def excess(fit: SurfelFit, split: Split) -> float:
-    """Misfit beyond noise, nats over as many spots as were fitted; measured on the select spots."""
+def misfit_and_noise(fit: SurfelFit, split: Split) -> tuple[float, float]:
+    """Misfit beyond noise, and noise: nats over as many spots as were fitted, measured on the select spots."""
     scores = score(fit, split.select)
-    return (scores.deviance_per_bin - scores.deviance_noise) / 2 * fit.counts.shape[1] * len(split.fit)
+    nats = fit.counts.shape[1] * len(split.fit) / 2
+    return (scores.deviance_per_bin - scores.deviance_noise) * nats, scores.deviance_noise * nats
 
 
 def significant(candidates: list[Candidate], s: CriticismSettings, over: float) -> list[Candidate]:

@@ -158,7 +158,7 @@ def _screened(candidate: Candidate, null: Null | None) -> Screened:
         statistic=candidate.statistic,
         p_value=candidate.p_value if null is None else null.p_value(candidate),
         retained_information=candidate.retained,
-        degrees=2 if effect.per_spot else len(candidate.step),
+        degrees=candidate.degrees,
         predicted_gain=candidate.gain,
         one_step=step,
         shape=candidate.shape,

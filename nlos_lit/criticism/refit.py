@@ -14,7 +14,7 @@ from nlos_lit.criticism.result import Scores
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.sensitivity import acting_order
 from nlos_lit.effects.base import Effect, Extension
-from nlos_lit.metrics import expected_deviance, nmse, nmse_noise_floor, poisson_deviance
+from nlos_lit.refine import score_spots
 from nlos_lit.surfel_fit import SurfelFit
 
 BOOTSTRAP = 400
@@ -92,14 +92,5 @@ def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> 
 
 def score(fit: SurfelFit, spots: np.ndarray) -> Scores:
     """Deviance and NMSE of spots, with their noise levels."""
-    index = torch.from_numpy(spots)
-    expected = fit.model.expected(index, fit.extension).clamp_min(1e-9)
-    first, last = fit.capture.gate
-    counts = torch.from_numpy(fit.capture.counts[spots, first:last].astype(np.float32))
-    values = (
-        poisson_deviance(counts, expected).mean(),
-        expected_deviance(expected),
-        nmse(counts, expected),
-        nmse_noise_floor(counts),
-    )
-    return Scores(*(v.item() for v in values))
+    found = score_spots(fit.model, fit.capture, torch.from_numpy(spots), fit.extension)
+    return Scores(found.deviance_per_bin, found.deviance_noise, found.nmse, found.nmse_noise_floor)

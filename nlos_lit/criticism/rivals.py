@@ -43,7 +43,7 @@ def choose(trials: list[Trial], block: np.ndarray) -> Trial:
         return short.nats < max(short.error, 0.02 * best.gain.nats)
 
     near = [t for t in trials if t is best or close(t)]
-    return min(near, key=lambda t: (len(t.candidate.step) if not t.candidate.effect.per_spot else 2, -t.gain.nats))
+    return min(near, key=lambda t: (t.candidate.degrees, -t.gain.nats))
 
 
 def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float) -> list[str]:

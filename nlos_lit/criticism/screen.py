@@ -45,6 +45,11 @@ class Candidate:
     shape: dict[str, float]
     direction: Tensor = field(repr=False)
 
+    @property
+    def degrees(self) -> int:
+        """Of freedom: width and share of a per-spot effect, else one an amplitude."""
+        return 2 if self.effect.per_spot else len(self.step)
+
 
 class Projector:
     """Takes from any columns what the base can explain by itself."""
@@ -106,7 +111,7 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
             direction = direction / direction.norm().clamp_min(1e-30)
             error = torch.linalg.inv(total + floor).diagonal().sqrt()
             best = Candidate(effect, max(0.0, statistic), p, retained, gain, step.float(), error.float(), shape, direction)
-    _set_shape(effect, best.shape)
+    effect.set_all(best.shape)
     return best
 
 
@@ -120,7 +125,7 @@ def _projected(
     """
     ranked = []
     for shape in shapes:
-        _set_shape(effect, shape)
+        effect.set_all(shape)
         z = weighted_columns(problem, effect)
         score, information = (z.T @ projector.residual).double(), (z.T @ z).double()
         floor = 1e-9 * information.diagonal().mean() + 1e-30
@@ -129,15 +134,10 @@ def _projected(
     ranked.sort(key=lambda entry: -entry[0])
     columns = []
     for _, shape, z in ranked[:KEPT]:
-        _set_shape(effect, shape)
+        effect.set_all(shape)
         columns.append(weighted_columns(problem, effect) if z is None else z)
     projected = projector.off(torch.cat(columns, 1)).split(columns[0].shape[1], dim=1)
     yield from zip([r[1] for r in ranked[:KEPT]], columns, (p.contiguous() for p in projected), strict=True)
-
-
-def _set_shape(effect: Effect, shape: dict[str, float]) -> None:
-    for name, value in shape.items():
-        effect.set(name, value)
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:

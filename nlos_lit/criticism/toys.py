@@ -39,9 +39,8 @@ class Null:
     def p_value(self, candidate: Candidate) -> float:
         """Of the stretched χ²; the number of shapes tried stays paid for."""
         effect = candidate.effect
-        degrees = 2 if effect.per_spot else len(candidate.step)
         stretched = candidate.statistic / self.stretch.get(effect.name, 1.0)
-        return min(1.0, len(effect.shape_grid()) * float(stats.chi2.sf(stretched, degrees)))
+        return min(1.0, len(effect.shape_grid()) * float(stats.chi2.sf(stretched, candidate.degrees)))
 
 
 def toy_capture(capture: Capture, fit: SurfelFit, seed: int) -> Capture:
@@ -90,7 +89,7 @@ def _toy(capture: Capture, pipeline: Pipeline, split: Split, settings: Criticism
     candidates, _ = look(fit, split, Scan.of(capture), settings, seed)
     result = {
         "statistic": {c.effect.name: c.statistic for c in candidates},
-        "degrees": {c.effect.name: 2 if c.effect.per_spot else len(c.step) for c in candidates},
+        "degrees": {c.effect.name: c.degrees for c in candidates},
         "largest": max(c.gain for c in candidates),
     }
     part = store / f".toy_{seed}.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -88,6 +89,11 @@ class Effect(nn.Module, Hooks):
         p = self.declared[name]
         value = torch.as_tensor(value, dtype=torch.float32).clamp(p.lower, p.upper)
         getattr(self, f"raw_{name}").copy_((torch.log(value) if p.log else value) / p.scale)
+
+    def set_all(self, values: Mapping[str, float]) -> None:
+        """Store several values by name."""
+        for name, value in values.items():
+            self.set(name, value)
 
     def reset(self) -> None:
         """The null; shapes at the middle of their grids."""

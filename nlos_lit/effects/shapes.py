@@ -37,7 +37,7 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
         excess = counts / base - 1
         best, most = {}, 0.0
         for shape in effect.shape_grid():
-            _set(effect, shape)
+            effect.set_all(shape)
             columns = []
             for p in effect.amplitudes:
                 effect.set(p.name, p.null + p.scale)
@@ -56,10 +56,5 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
                 best = shape | {p.name: p.null + float(x) for p, x in zip(effect.amplitudes, step, strict=True)}
                 most = gain
         effect.reset()
-        _set(effect, best)
+        effect.set_all(best)
         light = arriving() if effect.needs_paths else light
-
-
-def _set(effect: Effect, values: dict[str, float]) -> None:
-    for name, value in values.items():
-        effect.set(name, value)

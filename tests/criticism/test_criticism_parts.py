@@ -22,6 +22,7 @@ from nlos_lit.criticism.numerics import numerics
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import SIDE, profiles
 from nlos_lit.criticism.run import diagnose
+from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.toys import Null, read_toys, run_toys, toy_capture
 from nlos_lit.criticism.witness import direct_decays, log_gain, witness
 from nlos_lit.effects import Extension, Scan
@@ -31,8 +32,9 @@ from nlos_lit.surfel_fit import RefineSettings
 SCAN = Scan.of(capture_of(scattered(12)))
 
 
-def candidate(name: str, statistic: float, size: int = 1) -> SimpleNamespace:
-    return SimpleNamespace(effect=effect_of(name, SCAN), statistic=statistic, step=torch.zeros(size), gain=statistic / 2)
+def candidate(name: str, statistic: float, size: int = 1) -> Candidate:
+    nothing = torch.zeros(size)
+    return Candidate(effect_of(name, SCAN), statistic, 1.0, 1.0, statistic / 2, nothing, nothing, {}, nothing)
 
 
 def test_toys_by_hand(tmp_path):
