@@ -8,16 +8,16 @@ import time
 from pathlib import Path
 
 import hydra
-import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from data_modules.scenes import load_scene
 from nlos_lit import figures
-from nlos_lit.baselines import estimate_bytes, reconstruct
+from nlos_lit.baselines import estimate_bytes, reconstruct_directed
+from nlos_lit.baselines.surface import front_points
 from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
-from nlos_lit.export import write_json, write_volume
-from nlos_lit.geometry_metrics import depth_at
+from nlos_lit.export import write_json, write_points, write_volume
+from nlos_lit.geometry_metrics import geometry_errors
 from nlos_lit.memory import check_machine, parse_bytes
 from nlos_lit.scan import volume_grid
 from nlos_lit.summary import git_state, peak_memory_bytes, versions
@@ -38,12 +38,16 @@ def main(config: DictConfig) -> None:
     check_machine(needed, f"method={method['name']}")
     log.info("%s: volume %d x %d x %d voxels, about %.2f GiB", method["name"], *grid.shape[1:], grid.shape[0], needed / 2**30)
     setup = time.perf_counter() - began
-    volume = reconstruct(capture, grid, method["name"], budget_bytes=parse_bytes(settings["memory_budget"]), **method["options"])
+    budget = parse_bytes(settings["memory_budget"])
+    volume, field = reconstruct_directed(capture, grid, method["name"], budget_bytes=budget, **method["options"])
     seconds = time.perf_counter() - began - setup
     values = (volume / volume.max().clamp_min(1e-30)).numpy()
     write_volume(folder / "volume.h5", values, grid)
     shown = figures.volume_projections(values, grid, threshold=scene["threshold"], title=f"{scene['name']}, {method['name']}")
     figures.save_figure(shown, folder / "figures" / "volume.png")
+    points = front_points(values, grid, scene["threshold"], None if field is None else field.numpy())
+    write_points(folder / "points.ply", points)
+    figures.save_figure(figures.surface_plot(points), folder / "figures" / "surface.png")
     summary = {
         "scene": scene["name"],
         "method": method,
@@ -56,25 +60,10 @@ def main(config: DictConfig) -> None:
         "seed": settings["seed"],
     }
     if truth is not None:
-        front = np.where(values.max(0) >= scene["threshold"], grid.z[values.argmax(0)], np.nan)
-        summary["geometry"] = front_errors(front, truth, grid)
+        spacing = max(abs(step) for step in grid.pitch[:2])
+        summary["geometry"] = geometry_errors(points, truth, lateral_tolerance=spacing).to_dict()
     write_json(folder / "summary.json", summary)
     log.info("%.1f s; results in %s", seconds, folder)
-
-
-def front_errors(front: np.ndarray, truth, grid) -> dict[str, float]:
-    """Errors of the depth of the maximum along z, ``[nx, ny]`` m with NaN where nothing was found, against the truth."""
-    x, y = np.meshgrid(grid.x, grid.y, indexing="ij")
-    depth = depth_at(truth, np.stack([x.ravel(), y.ravel()], axis=1))[0].reshape(x.shape)
-    both = np.isfinite(front) & np.isfinite(depth)
-    error = front[both] - depth[both]
-    return {
-        "depth_median_abs": float(np.median(np.abs(error))),
-        "depth_p95_abs": float(np.quantile(np.abs(error), 0.95)),
-        "depth_bias": float(error.mean()),
-        "coverage": float(both.sum() / np.isfinite(depth).sum()),
-        "off_truth": float((np.isfinite(front) & ~np.isfinite(depth)).sum() / np.isfinite(front).sum()),
-    }
 
 
 if __name__ == "__main__":

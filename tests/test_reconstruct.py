@@ -24,7 +24,7 @@ def test_every_method_by_one_sweep(tmp_path):
     done = reconstruct("-m", "method=glob(*)", *SMALL, f"hydra.sweep.dir={tmp_path}")
     assert done.returncode == 0, done.stderr[-2000:]
     summaries = {path.parent.name.split("_")[-1]: path for path in tmp_path.glob("*/summary.json")}
-    assert set(summaries) == {"rsd", "lct", "fk", "bp", "fbp"}
+    assert set(summaries) == {"rsd", "lct", "dlct", "fk", "bp", "fbp"}
     for method, path in summaries.items():
         summary = json.loads(path.read_text())
         assert summary["method"]["name"] == method

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from nlos_lit.baselines.backprojection import bp, bp_bytes, fbp, fbp_bytes
+from nlos_lit.baselines.dlct import directed_volume, dlct, dlct_bytes, dlct_field
 from nlos_lit.baselines.light_cone import lct, lct_bytes
 from nlos_lit.baselines.migration import fk, fk_bytes
 from nlos_lit.baselines.rsd import rsd, rsd_bytes
@@ -20,11 +21,13 @@ from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError, UserError
 from nlos_lit.grid import VolumeGrid
 
-METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "fk": fk, "rsd": rsd}
+METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "dlct": dlct, "fk": fk, "rsd": rsd}
+FIELDS: dict[str, Callable[..., torch.Tensor]] = {"dlct": dlct_field}  # methods that find the surface's direction as well
 _BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {
     "bp": bp_bytes,
     "fbp": fbp_bytes,
     "lct": lct_bytes,
+    "dlct": dlct_bytes,
     "fk": fk_bytes,
     "rsd": rsd_bytes,
 }
@@ -50,6 +53,24 @@ def reconstruct(
         CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
         MemoryBudgetError: the estimate is above the budget; nothing was allocated.
     """
+    function = _checked(capture, grid, method, budget_bytes, options)
+    return function(capture, grid, **options)
+
+
+def reconstruct_directed(
+    capture: Capture, grid: VolumeGrid, method: str, *, budget_bytes: int | None = None, **options: Any
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """As :func:`reconstruct`, with the vectors ``[3, nz, nx, ny]`` along the surface's normal of a method in ``FIELDS``."""
+    function = _checked(capture, grid, method, budget_bytes, options)
+    if method not in FIELDS:
+        return function(capture, grid, **options), None
+    field = FIELDS[method](capture, grid, **options)
+    return directed_volume(field), field
+
+
+def _checked(
+    capture: Capture, grid: VolumeGrid, method: str, budget_bytes: int | None, options: dict[str, Any]
+) -> Callable[..., torch.Tensor]:
     function = _known(method)
     allowed = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
     if unknown := sorted(set(options) - set(allowed)):
@@ -59,7 +80,7 @@ def reconstruct(
             f"method {method} needs {need / 2**30:.2f} GiB, above the budget of {budget_bytes / 2**30:.2f} GiB; "
             f"sum time bins or spots of the capture, make the volume smaller, or raise the budget"
         )
-    return function(capture, grid, **options)
+    return function
 
 
 def estimate_bytes(capture: Capture, grid: VolumeGrid, method: str) -> int:

@@ -10,6 +10,8 @@ and is inverted by a Wiener filter.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from scipy.fft import next_fast_len
@@ -19,7 +21,7 @@ from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
-from nlos_lit.scan import path_range
+from nlos_lit.scan import Lattice, path_range
 
 
 def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:
@@ -41,20 +43,43 @@ def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float 
     """
     if not snr > 0:
         raise UserError(f"lct needs a positive snr; found {snr}")
-    lattice = confocal_lattice(capture, "lct")
+    cone = light_cone(capture, grid, "lct", falloff)
+    inverse = wiener_cone(cone.values, cone.lattice.pitch, cone.step, snr)
+    along_x, along_y = lateral_weights(cone.lattice, grid)
+    along_z = cone_to_depth(cone, grid.z - cone.lattice.origin[2], grid.pitch[2])
+    return apply_weights(inverse, along_z, along_x, along_y).clamp_(min=0)
+
+
+class Cone(NamedTuple):
+    """Confocal transients over ``v``: ``values [M, nx, ny]``, cell ``k`` covering ``[first + k·step, first + (k+1)·step)`` m²."""
+
+    values: torch.Tensor
+    lattice: Lattice
+    first: float
+    step: float
+
+
+def light_cone(capture: Capture, grid: VolumeGrid, method: str, falloff: float) -> Cone:
+    """``v^(p/2)`` times counts per unit of ``v``, with ``p`` = ``falloff``; ``method`` is named in messages.
+
+    Raises:
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
+    """
+    lattice = confocal_lattice(capture, method)
     transients, start = gated_transients(capture, path_range(capture, grid)[1], 0.0)
     bins = transients.shape[1]
     edges = ((start + np.arange(bins + 1) * capture.bin_length) / 2) ** 2
     step = (edges[-1] - edges[0]) / bins
     ordered = transients[torch.from_numpy(lattice.spots)].T
-    cone = torch.sparse.mm(_path_to_cone(edges, step, falloff), ordered).view(bins, *lattice.shape)
-    del transients, ordered
-    inverse = wiener_cone(cone, lattice.pitch, step, snr)
-    along_x, along_y = (
-        linear_weights(lattice.origin[a], lattice.pitch[a], lattice.shape[a], (grid.x, grid.y)[a], grid.pitch[a]) for a in (0, 1)
-    )
-    along_z = _cone_to_depth(edges[0], step, bins, grid.z - lattice.origin[2], grid.pitch[2])
-    return apply_weights(inverse, along_z, along_x, along_y).clamp_(min=0)
+    values = torch.sparse.mm(_path_to_cone(edges, step, falloff), ordered).view(bins, *lattice.shape)
+    return Cone(values, lattice, float(edges[0]), float(step))
+
+
+def lateral_weights(lattice: Lattice, grid: VolumeGrid) -> tuple[torch.Tensor, torch.Tensor]:
+    """Matrices that resample from the scan's lattice to the grid, along x and along y."""
+    axes = zip(lattice.origin[:2], lattice.pitch, lattice.shape, (grid.x, grid.y), grid.pitch[:2], strict=True)
+    along_x, along_y = (linear_weights(*axis) for axis in axes)
+    return along_x, along_y
 
 
 def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr: float) -> torch.Tensor:
@@ -69,8 +94,8 @@ def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr
     Returns:
         ``[M, nx, ny]`` on the same samples in ``u``.
     """
-    size = _padded(cone.shape)
-    kernel = _cone_kernel(cone.shape, size, pitch, step)
+    size = padded(cone.shape)
+    kernel = cone_kernel(cone.shape, size, pitch, step)
     noise = float(kernel.square().sum()) / snr
     spectrum = torch.fft.rfftn(kernel)
     del kernel
@@ -86,7 +111,7 @@ def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
     """Bytes that :func:`lct` allocates at its peak."""
     lattice = confocal_lattice(capture, "lct")
     bins = gated_bins(capture, grid)
-    m, nx, ny = _padded((bins, *lattice.shape))
+    m, nx, ny = padded((bins, *lattice.shape))
     native = bins * capture.n_spots
     return 4 * (3 * native + 4 * m * nx * (ny + 2) + grid.n_voxels + bins * grid.shape[0])
 
@@ -97,11 +122,12 @@ def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
     return min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1) - capture.gate[0]
 
 
-def _padded(shape: tuple[int, ...]) -> tuple[int, ...]:
+def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """A size whose FFT is fast and at least twice as long along every axis, so that a convolution is linear."""
     return tuple(next_fast_len(2 * n, real=True) for n in shape)
 
 
-def _cone_kernel(shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float) -> torch.Tensor:
+def cone_kernel(shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float) -> torch.Tensor:
     """``δ(x² + y² - w)`` on the lattice: at each lateral offset one lattice cell's area, shared by the two nearest ``w``."""
     bins, nx, ny = shape
     x, y = np.meshgrid(np.arange(1 - nx, nx), np.arange(1 - ny, ny), indexing="ij")
@@ -127,10 +153,14 @@ def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tenso
     return torch.sparse_coo_tensor(index, torch.from_numpy(value).float(), (bins, bins), check_invariants=True)
 
 
-def _cone_to_depth(first: float, step: float, bins: int, depth: np.ndarray, width: float) -> torch.Tensor:
-    """Matrix ``[nz, M]``: ``ρ(z) = 2z·R(z²)``, linear in ``u`` between cell centres, averaged over each voxel's depth."""
+def cone_to_depth(cone: Cone, depth: np.ndarray, width: float, power: int = 1) -> torch.Tensor:
+    """Matrix ``[nz, M]``: ``2 z^power·R(z²)``, linear in ``u`` between cell centres, averaged over each voxel's depth.
+
+    With ``power`` 1 this is the density in z, ``ρ(z) = 2z·R(z²)``.
+    """
+    bins, first, step = len(cone.values), cone.first, cone.step
     finest = np.sqrt(first + step * bins) - np.sqrt(first + step * (bins - 1))
     parts = max(1, int(np.ceil(abs(width) / finest)))
     z = depth[:, None] + ((np.arange(parts) + 0.5) / parts - 0.5) * abs(width)
     weights = linear_weights(first + step / 2, step, bins, np.where(z > 0, z**2, -1.0).reshape(-1), 0.0)
-    return (weights.view(len(depth), parts, bins) * torch.from_numpy(2 * z).float()[..., None]).mean(1)
+    return (weights.view(len(depth), parts, bins) * torch.from_numpy(2 * z**power).float()[..., None]).mean(1)

@@ -107,7 +107,7 @@ def test_gated_transients():
 
 def test_unknown_method_and_option():
     capture = capture_of(WALL, WALL, [POINT], 128, 0.02)
-    with pytest.raises(UserError, match="unknown method 'mirror'; choose one of bp, fbp, lct, fk, rsd"):
+    with pytest.raises(UserError, match="unknown method 'mirror'; choose one of bp, fbp, lct, dlct, fk, rsd"):
         reconstruct(capture, GRID, "mirror")
     with pytest.raises(UserError, match="method lct has no option 'sigma'; it takes snr, falloff"):
         reconstruct(capture, GRID, "lct", sigma=1.0)
