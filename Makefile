@@ -6,7 +6,7 @@ VENV ?= .venv
 ARGS ?=
 STAMP := $(VENV)/.installed
 
-.PHONY: run test slow lint clean setup
+.PHONY: run test slow lint clean setup results tal
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
@@ -19,6 +19,17 @@ slow: $(STAMP)
 lint: $(STAMP)
 	$(VENV)/bin/python -m ruff check .
 
+# The tables and figures of docs/results.md, from what `python results.py all size=full` has left under outputs/evidence/full.
+results: $(STAMP)
+	$(VENV)/bin/python results.py page $(ARGS)
+
+# y-tal for tests/baselines/test_baseline_tal.py
+tal: .venv-tal/.installed
+.venv-tal/.installed: scripts/requirements-tal.txt
+	$(PYTHON) -m venv .venv-tal
+	.venv-tal/bin/python -m pip install -r $<
+	touch $@
+
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
@@ -26,4 +37,4 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
 	touch $@
 
 clean:
-	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-tal build *.egg-info .pytest_cache .ruff_cache .hypothesis
