@@ -1,4 +1,4 @@
-"""Run by the interpreter that has y-tal: CAPTURE OUT.npz WAVELENGTH CYCLES FIRST STEP PLANES; leaves pf [nz, nx, ny], fk [T, nx, ny]."""
+"""Run by the interpreter that has y-tal: CAPTURE OUT.npz WAVELENGTH CYCLES FIRST STEP PLANES, leaves pf and fk."""
 
 import sys
 
