@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -12,11 +13,13 @@ from torch import Tensor, nn
 from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError
 from nlos_lit.functional import phasor as F
+from nlos_lit.functional.even import convolution_length
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.parameters import BoundedParameter
 from nlos_lit.scan import ScanGeometry, path_range, scan_geometry
 
 ALIGNED = 1e-3  # how far a voxel may lie from its lattice point, in voxels
+_SCRATCH = 100 * 2**20  # products of one run of frequencies, and what the libraries keep
 REACH = 5.0  # virtual pulse half-length in units of σ_pf, where its envelope is 4e-6
 
 
@@ -50,7 +53,12 @@ class LatticeLayout:
     geometry: ScanGeometry
     refine: int
     offset: tuple[int, int]
-    padded_points: int  # of the zero-padded FFT
+    padded_points: int  # of the zero-padded transform
+
+    def plane_bytes(self, n_freq: int, rank: int) -> int:
+        """Working memory of one plane: kernel spectra of all frequencies when confocal, else what is summed over them."""
+        quarter = self.padded_points // 4 if self.geometry.fixed is None else 0
+        return 8 * n_freq * quarter + 8 * rank * self.padded_points * 3
 
 
 class PhasorImaging(nn.Module):
@@ -98,11 +106,17 @@ class PhasorImaging(nn.Module):
         self.omega, self.basis = omega.to(device), F.weight_basis(omega, *bounds, self.tolerance).to(device)
         n_freq, rank = self.basis.shape
         layout = self._layout(capture)
+        first, last = self._window(capture)
+        reading = (
+            4 * capture.n_spots * (last - first) * 2 + 16 * capture.n_spots * n_freq
+        )  # counts twice, two halves of the spectrum
         if layout is None:
-            working = capture.n_spots * n_freq * 8 + 256 * capture.n_spots * 64
+            propagating = capture.n_spots * (8 * n_freq + 256 * 96)
         else:
-            working = n_freq * layout.padded_points * 8 * (len(layout.geometry.rows) * 2 + 5)
-        working += 4 * capture.n_spots * capture.n_bins + 4 * self.grid.n_voxels * 8
+            spectra = 8 * n_freq * layout.padded_points * len(layout.geometry.rows)
+            propagating = spectra + max(16 * n_freq * capture.n_spots * layout.refine**2, layout.plane_bytes(n_freq, rank))
+        # Whole transients and spectra are gone when planes are propagated, and the field fills up plane by plane.
+        working = max(reading, propagating) + _SCRATCH
         values = self.grid.n_voxels * 2 * rank
         for precision, size in ((torch.float32, 4), (torch.float16, 2)):
             if values * size + working <= memory_budget:
@@ -127,28 +141,21 @@ class PhasorImaging(nn.Module):
         Args:
             progress: called with (planes or blocks done, of how many).
         """
-        device = self.gain.device
-        counts = torch.from_numpy(capture.gated_counts()).to(device)
-        if spots is not None:
-            unused = np.setdiff1d(np.arange(capture.n_spots), spots)
-            counts[torch.from_numpy(unused)] = 0
-        first, last = capture.gate
-        time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length
-        spectrum = F.spectrum(counts, time, self.omega)
+        nearest = path_range(capture, self.grid)[0] / 2
+        spectrum = self._spectrum(capture, spots)
+        # Only ratios matter (the intensity has a unit maximum); this scale keeps half precision in range.
+        scale = float(spectrum.abs().mean()) * capture.n_spots / nearest**2
         layout = self._layout(capture)
         if layout is None:
-            blocks = self._direct(capture, spectrum)
-            total = -(-self.grid.n_voxels // 256)
+            blocks, total = self._direct(capture, spectrum), -(-self.grid.n_voxels // 256)
         else:
-            blocks = self._lattice(layout, spectrum)
-            total = self.grid.shape[0]
-        # Only ratios matter (the intensity has a unit maximum); this scale keeps half precision in range.
-        nearest = path_range(capture, self.grid)[0] / 2
-        scale = float(spectrum.abs().mean()) * capture.n_spots / nearest**2
-        field = torch.empty(self.grid.n_voxels, 2, self.basis.shape[1], dtype=plan.precision, device=device)
+            blocks, total = self._lattice(layout, spectrum), self.grid.shape[0]
+        del spectrum  # the propagation drops it, too, as soon as it can
+        field = torch.empty(self.grid.n_voxels, 2, self.basis.shape[1], dtype=plan.precision, device=self.gain.device)
         row = 0
         for done, block in enumerate(blocks, start=1):
-            field[row : row + len(block)] = (block / scale).to(plan.precision)
+            torch.div(block, scale, out=block)
+            field[row : row + len(block)] = block
             row += len(block)
             if progress is not None:
                 progress(done, total)
@@ -162,11 +169,28 @@ class PhasorImaging(nn.Module):
         intensity = self.gain * (magnitude if self.power == 1 else magnitude**self.power)
         return intensity / intensity.max()
 
+    def _window(self, capture: Capture) -> tuple[int, int]:
+        """Bins inside the gate from which a virtual pulse can reach a voxel."""
+        near, far = path_range(capture, self.grid)
+        reach = REACH * self.sigma_pf.upper
+        first = math.floor((near - reach - capture.t_start) / capture.bin_length)
+        last = math.ceil((far + reach - capture.t_start) / capture.bin_length)
+        return max(first, capture.gate[0]), min(last, capture.gate[1])
+
     def _frequencies(self, capture: Capture) -> Tensor:
-        start, end = capture.path_gate
+        start, end = (capture.t_start + edge * capture.bin_length for edge in self._window(capture))
         near, far = path_range(capture, self.grid)
         period = max(end - near, far - start) + REACH * self.sigma_pf.upper
         return F.frequencies((self.omega_pf.lower, self.omega_pf.upper), self.sigma_pf.lower, period)
+
+    def _spectrum(self, capture: Capture, spots: np.ndarray | None) -> Tensor:
+        """``[F, S]`` of the transients of ``spots``, zero elsewhere."""
+        first, last = self._window(capture)
+        counts = torch.from_numpy(capture.counts[:, first:last].astype(np.float32)).to(self.gain.device)
+        if spots is not None:
+            counts[torch.from_numpy(np.setdiff1d(np.arange(capture.n_spots), spots))] = 0
+        time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length
+        return F.spectrum(counts, time, self.omega)
 
     def _layout(self, capture: Capture) -> LatticeLayout | None:
         """How the voxels lie on the scan's lattice; None where they or the spots do not, and the direct sum is needed."""
@@ -182,7 +206,7 @@ class PhasorImaging(nn.Module):
         if refine < 1 or apart + stretch > ALIGNED:
             return None
         sizes = [(n - 1) * refine + 1 for n in lattice.shape]
-        padded = [F.next_fast_length(n + m - 1) for n, m in zip(sizes, grid.shape[1:], strict=True)]
+        padded = [convolution_length(n, m, o) for n, m, o in zip(sizes, grid.shape[1:], offset, strict=True)]
         return LatticeLayout(geometry, refine, offset, padded[0] * padded[1])
 
     def _lattice(self, layout: LatticeLayout, spectrum: Tensor) -> Iterator[Tensor]:

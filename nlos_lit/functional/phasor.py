@@ -8,11 +8,14 @@ span: ``u = Σ_r (Bᵀw)_r (A B)_r``.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 
 import torch
 from torch import Tensor
+
+from nlos_lit.functional.even import EvenAxis, Rotation, even_transform, fold, inverse, mirror, polar, runs, unfold
 
 
 def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> Tensor:
@@ -83,7 +86,7 @@ def lattice_phasors(
 
     Args:
         field: ``[L, F, nx, ny]`` complex spectrum on the aperture lattice; L = 1 but for exhaustive scans.
-        omega: ``[F]`` rad/m.
+        omega: ``[F]`` equally spaced, rad/m.
         basis: ``[F, R]`` as from :func:`weight_basis`.
         pitch: spacing of the lattice, m; voxels lie on the same lattice.
         offset: index of the first voxel column and row relative to the aperture's first point.
@@ -95,44 +98,49 @@ def lattice_phasors(
     Yields:
         ``[mx·my, 2, R]`` float32, real and imaginary part, plane after plane.
     """
-    n_scans, _, nx, ny = field.shape
-    mx, my = shape
-    padded = [next_fast_length(nx + mx - 1), next_fast_length(ny + my - 1)]
-    aperture = torch.fft.fft2(field, s=padded)
-    device = field.device
-    confocal = fixed is None
-    # Voxel m lies m - n + offset lattice steps from aperture point n; the kernel is even, so only absolute steps are evaluated.
-    index = []
-    for axis, n, m in ((0, nx, mx), (1, ny, my)):
-        shifts = torch.zeros(padded[axis], dtype=torch.long)
-        for displacement in range(1 - n, m):
-            shifts[displacement % padded[axis]] = abs(displacement + offset[axis])
-        index.append(shifts.to(device))
-    squares = [
-        (pitch[a] * torch.arange(int(index[a].max()) + 1, dtype=torch.float64, device=device)) ** 2 for a in (0, 1)
-    ]
-    lateral = squares[0][:, None] + squares[1][None, :]
-    wave = omega.to(device)[:, None, None] * (2.0 if confocal else 1.0)
+    n_scans, n_freq, nx, ny = field.shape
+    device, rank = field.device, basis.shape[1]
+    x, y = (EvenAxis(n, m, o, device) for n, m, o in zip((nx, ny), shape, offset, strict=True))
+    folded = (4, x.half, y.half) if fixed is None else (x.length, y.length)
+    spectra = torch.empty(n_scans, n_freq, *folded, dtype=torch.complex64, device=device)
+    for scan, part in itertools.product(range(n_scans), runs(n_freq, x.length * y.length)):
+        shifted = torch.fft.fft2(field[scan, part], s=(x.length, y.length)) * (x.shift[:, None] * y.shift)
+        spectra[scan, part] = fold(shifted, x, y) if fixed is None else shifted
+    del field, shifted
+    lateral = ((pitch[0] * x.lags) ** 2)[:, None] + (pitch[1] * y.lags) ** 2
     weights = basis.to(device=device, dtype=torch.float32)
-    rank = weights.shape[1]
-    if not confocal:
-        xs = voxel_origin[0] + pitch[0] * torch.arange(mx, dtype=torch.float64, device=device)
-        ys = voxel_origin[1] + pitch[1] * torch.arange(my, dtype=torch.float64, device=device)
+    if fixed is None:
+        step, wave = 2 * _step(omega), 2 * omega.to(device)
+        parts, spread = runs(n_freq, x.half * y.half), torch.empty(n_freq, x.half, y.half, dtype=torch.complex64, device=device)
+        for z in depth.tolist():
+            kernel = Rotation(torch.sqrt(lateral + z * z), step, n_freq, 2)
+            for part in parts:
+                spread[part] = even_transform(kernel.values(wave, part), x, y)
+            mixed = torch.empty(rank, *folded, 2, device=device)
+            for quarter, rows in itertools.product(range(4), runs(x.half, n_freq * y.half)):
+                product = spectra[0, :, quarter, rows] * spread[:, rows]
+                mixed[:, quarter, rows] = (weights.T @ _real_rows(product)).view(rank, -1, y.half, 2)
+            yield _voxels_first(inverse(unfold(torch.view_as_complex(mixed), x, y), *shape))
+        return
+    step, wave = _step(omega), omega.to(device)
+    xs = voxel_origin[0] + pitch[0] * torch.arange(shape[0], dtype=torch.float64, device=device)
+    ys = voxel_origin[1] + pitch[1] * torch.arange(shape[1], dtype=torch.float64, device=device)
     for z in depth.tolist():
-        distance = torch.sqrt(lateral + z * z)
-        magnitude = 1 / distance**2 if confocal else 1 / distance
-        kernel = _polar(magnitude, -wave * distance)
-        spread = torch.fft.fft2(kernel[:, index[0]][:, :, index[1]])
-        if confocal:
-            mixed = _mix(weights, aperture[0] * spread)
-            plane = torch.fft.ifft2(mixed)[:, :mx, :my]
-        else:
-            plane = torch.zeros(rank, mx, my, dtype=torch.complex64, device=device)
-            for scan in range(n_scans):
-                arrived = torch.fft.ifft2(aperture[scan] * spread)[:, :mx, :my]
-                leg = torch.sqrt((xs[:, None] - fixed[scan, 0]) ** 2 + (ys - fixed[scan, 1]) ** 2 + (z - fixed[scan, 2]) ** 2)
-                plane += _mix(weights, arrived * _polar(1 / leg, -wave * leg))
-        yield torch.view_as_real(plane).permute(1, 2, 3, 0).reshape(mx * my, 2, rank)
+        kernel = Rotation(torch.sqrt(lateral + z * z), step, n_freq, 1)
+        to_fixed = [torch.sqrt((xs[:, None] - p[0]) ** 2 + (ys - p[1]) ** 2 + (z - p[2]) ** 2) for p in fixed.to(device)]
+        legs = [Rotation(distance, step, n_freq, 1) for distance in to_fixed]
+        mixed = torch.zeros(rank, shape[0] * shape[1] * 2, device=device)
+        for part in runs(n_freq, x.length * y.length):
+            spread = mirror(mirror(even_transform(kernel.values(wave, part), x, y), 1, x), 2, y)
+            for scan, leg in enumerate(legs):
+                arrived = inverse(spectra[scan, part] * spread, *shape)
+                mixed.addmm_(weights[part].T, _real_rows(arrived * leg.values(wave, part)))
+        yield _voxels_first(torch.view_as_complex(mixed.view(rank, -1, 2)))
+
+
+def _voxels_first(plane: Tensor) -> Tensor:
+    """Complex ``[R, …]`` as real ``[V, 2, R]``."""
+    return torch.view_as_real(plane.reshape(len(plane), -1)).permute(1, 2, 0)
 
 
 def direct_phasors(
@@ -153,14 +161,14 @@ def direct_phasors(
     device = field.device
     weights = basis.to(device=device, dtype=torch.float32)
     omega = omega.to(device)
-    step = omega[1] - omega[0] if len(omega) > 1 else omega[0]
+    step = _step(omega)
     same = torch.equal(laser, sensor)
     for chunk in voxels.to(device).split(block):
         to_sensor = torch.cdist(chunk.double(), sensor.to(device).double())
         to_laser = to_sensor if same else torch.cdist(chunk.double(), laser.to(device).double())
         path = to_sensor + to_laser
-        factor = _polar(1 / (to_sensor * to_laser), -omega[0] * path)
-        advance = _polar(torch.ones_like(path), -step * path)
+        factor = polar(1 / (to_sensor * to_laser), -omega[0] * path)
+        advance = polar(torch.ones_like(path), -step * path)
         values = torch.empty(len(omega), len(chunk), dtype=torch.complex64, device=device)
         for f in range(len(omega)):
             values[f] = factor @ field[f]
@@ -181,7 +189,7 @@ class PhasorMagnitude(torch.autograd.Function):
         if field.dtype == weights.dtype:
             parts = (rows @ weights).view(voxels, 2)
         else:
-            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(1 << 19)]).view(voxels, 2)
+            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(1 << 15)]).view(voxels, 2)
         magnitude = torch.linalg.vector_norm(parts, dim=1)
         ctx.save_for_backward(field, parts, magnitude)
         return magnitude
@@ -191,31 +199,22 @@ class PhasorMagnitude(torch.autograd.Function):
         field, parts, magnitude = ctx.saved_tensors
         touched = torch.nonzero((grad != 0) & (magnitude > 0)).squeeze(1)
         result = torch.zeros(field.shape[2], dtype=parts.dtype, device=parts.device)
-        for chunk in touched.split(1 << 19):
+        for chunk in touched.split(1 << 15):
             pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
             result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(-1, len(result))
         return None, result
-
-
-def next_fast_length(n: int) -> int:
-    """Smallest number ≥ n whose only prime factors are 2, 3 and 5."""
-    while True:
-        rest = n
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return n
-        n += 1
-
-
-def _polar(magnitude: Tensor, phase: Tensor) -> Tensor:
-    """Complex64 from float64 magnitude and phase; the phase is reduced before it loses digits."""
-    turn = torch.remainder(phase, 2 * math.pi).to(torch.float32)
-    return torch.polar(magnitude.to(torch.float32).expand_as(turn), turn)
 
 
 def _mix(weights: Tensor, values: Tensor) -> Tensor:
     """``Σ_f weights[f, r] values[f, …]`` with real weights and complex values."""
     flat = torch.view_as_real(values.contiguous()).reshape(values.shape[0], -1)
     return torch.view_as_complex((weights.T @ flat).reshape(-1, *values.shape[1:], 2))
+
+
+def _step(omega: Tensor) -> float:
+    return float(omega[1] - omega[0]) if len(omega) > 1 else 0.0
+
+
+def _real_rows(values: Tensor) -> Tensor:
+    """Complex ``[F, …]`` as real ``[F, 2·…]``."""
+    return torch.view_as_real(values.contiguous()).reshape(len(values), -1)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
+from nlos_lit.functional.even import next_fast_length
 from nlos_lit.functional.phasor import (
     PhasorMagnitude,
     direct_phasors,
     frequencies,
     lattice_phasors,
-    next_fast_length,
     spectrum,
     virtual_illumination,
     weight_basis,
