@@ -158,8 +158,9 @@ class SurfelFit:
         steps *= 2 if last else 1
         # The response waits for the places, the tie for the surface: both would otherwise settle around errors of the seeds.
         response_rate = s.response_rate * (0.3 if settling else 1.0)
-        tie = s.tie * 0.3 ** max(0, left - 1) / (len(self.train) * self.counts.shape[1])
-        cost = s.surfel_cost / (len(self.train) * self.counts.shape[1])
+        per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
+        tie = s.tie * 0.3 ** max(0, left - 1) * per_count
+        cost = s.surfel_cost * per_count
         groups = [
             {"params": [model.raw_depth], "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
@@ -177,7 +178,7 @@ class SurfelFit:
             rows = self._batch()
             expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
             fit = (expected - torch.xlogy(self.counts[rows], expected)).mean()
-            loss = fit + tie * model.bending() + cost * model.presence()
+            loss = fit + tie * model.bending() + cost * model.presence() + per_count * self.extension.penalty()
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

@@ -37,7 +37,8 @@ class CriticismSettings:
         level: largest p-value, Holm-adjusted over all effects.
         least_gain: nats that the score test must predict …
         least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
-        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds.
+        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds;
+            the one that was screened best is always among them.
         far_off: misfit over noise from which on single-path effects are finalists whatever their score.
         similar: correlation of projected sensitivities from which on two effects are one group.
         steps: batches of a refit (and as many again at falling rate).
@@ -127,7 +128,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         tell(f"refitting with {candidate.effect.name}")
         trials.append(trial(candidate, refit_with(fit, [candidate], s.steps, seed)))
     trials.sort(key=lambda t: -t.gain.nats)
-    finalists = [(t.candidate, t.fit.extension) for t in trials[: s.finalists]]
+    finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is wanted[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]

@@ -30,7 +30,7 @@ class Uncertainty:
         problem = build_problem(fit.model, fit.extension, spots, counts, with_effects=False)
         projector = Projector(problem)
         z = projector.off(torch.cat([weighted_columns(problem, e, shapes=True) for e in self.effects], 1))
-        information = (z.T @ z).double()
+        information = (z.T @ z).double() + torch.diag(torch.cat([e.precision() for e in self.effects]).double() * share)
         floor = 1e-9 * information.diagonal().mean() * torch.eye(len(information), dtype=torch.float64)
         inverse = torch.linalg.inv(information + floor)
         by_spot = (z * projector.residual[:, None]).view(len(spots), -1, z.shape[1]).sum(1).double()

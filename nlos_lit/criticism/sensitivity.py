@@ -82,6 +82,9 @@ def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, count
     residual = (counts - expected).reshape(-1) * weight
     prior = torch.zeros(nuisance.shape[1])
     prior[2 * m : 2 * m + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
+    if accepted:
+        own = torch.cat([e.precision() for e in accepted])
+        prior[len(prior) - len(own) :] = own
     return Problem(model, extension, spots, counts, expected, nuisance, prior, residual, transients)
 
 
@@ -236,7 +239,7 @@ def _tilt_fields(model: SurfelModel) -> Tensor:
     xy = model.centre().detach()[:, :2]
     low, high = xy.amin(0), xy.amax(0)
     place = 2 * (xy - low) / (high - low).clamp_min(1e-6) - 1
-    fields = smooth_map_basis(place, 5) if len(xy) > 50 else place[:, :0]
+    fields = smooth_map_basis(place, 5)[0] if len(xy) > 50 else place[:, :0]
     return torch.cat([torch.ones(len(xy), 1), fields], 1)
 
 

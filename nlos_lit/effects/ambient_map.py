@@ -30,12 +30,12 @@ class AmbientMap(SmoothEffect):
     coefficients = "level_map"
 
     @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
+    def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
         return over_wall(scan, 5)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("level_map", "1", 0.0, 0.1, -1.5, 1.5, size=cls.basis(scan).shape[1]),)
+        return cls.coefficient(scan, "1", 0.1, 1.5, 0.7)
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         return background * torch.exp(self.field(spots))[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -27,6 +28,7 @@ class Parameter:
         lower, upper: bounds.
         size: number of coefficients; they share null, scale and bounds.
         log: shape that is stored as its logarithm (``scale`` is then a change of the logarithm).
+        prior: standard deviation of each coefficient around the null, in its unit, for those that spots alone may not settle.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Parameter:
     size: int = 1
     grid: tuple[float, ...] = ()
     log: bool = False
+    prior: tuple[float, ...] = ()
 
 
 class Quantity(NamedTuple):
@@ -70,6 +73,7 @@ class Effect(nn.Module, Hooks):
         for p in self.declared.values():
             self.register_parameter(f"raw_{p.name}", nn.Parameter(torch.zeros(p.size)))
         self.width, self.share = 0.0, 1.0  # per-spot effects: of their distribution, and how many spots have it
+        self.prior_scale = 1.0  # of all prior deviations
         self.reset()
 
     @classmethod
@@ -105,6 +109,24 @@ class Effect(nn.Module, Hooks):
         """Bring every parameter back within its bounds, after a step of an optimiser."""
         for p in self.declared.values():
             self.set(p.name, self.value(p.name))
+
+    def precision(self) -> Tensor:
+        """Prior precision of all stored values (amplitudes in order, then shapes): [k], 0 where there is no prior."""
+        parts = []
+        for p in self.declared.values():
+            deviation = torch.tensor(p.prior or (math.inf,) * p.size) * (self.prior_scale / p.scale)
+            parts.append(deviation.square().reciprocal())
+        return torch.cat(parts) if parts else torch.zeros(0)
+
+    def penalty(self) -> Tensor:
+        """Nats that the prior takes for the present values: ``½ Σ (value/deviation)²``; 0 at the null."""
+        total = torch.zeros(())
+        for p in self.declared.values():
+            if p.prior:
+                raw = getattr(self, f"raw_{p.name}")
+                deviation = torch.tensor(p.prior, device=raw.device) * (self.prior_scale / p.scale)
+                total = total.to(raw.device) + 0.5 * ((raw - (p.null or 0.0) / p.scale) / deviation).square().sum()
+        return total
 
     @property
     def amplitudes(self) -> list[Parameter]:
@@ -173,3 +195,7 @@ class Extension(nn.Module, Hooks):
     def clamp(self) -> None:
         for effect in self.effects:
             effect.clamp()
+
+    def penalty(self) -> Tensor | float:
+        """Nats that the priors of all effects take."""
+        return sum(effect.penalty() for effect in self.effects)

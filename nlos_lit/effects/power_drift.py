@@ -33,12 +33,12 @@ class PowerDrift(SmoothEffect):
     ends: ClassVar[bool] = True
 
     @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
+    def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
         return over_time(scan)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("drift", "1", 0.0, 0.05, -1.5, 1.5, size=cls.basis(scan).shape[1]),)
+        return cls.coefficient(scan, "1", 0.05, 1.5, 0.5)
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         return signal * torch.exp(self.field(spots))[:, None]

@@ -33,13 +33,12 @@ class TimeDrift(SmoothEffect):
     ends: ClassVar[bool] = True
 
     @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
+    def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
         return over_time(scan)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        reach = 0.1 * scan.n_bins * scan.bin_length
-        return (Parameter("drift", "m", 0.0, scan.bin_length, -reach, reach, size=cls.basis(scan).shape[1]),)
+        return cls.coefficient(scan, "m", scan.bin_length, 0.1 * scan.n_bins * scan.bin_length, 4 * scan.bin_length)
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.field(spots)[:, None, None]

@@ -31,12 +31,12 @@ class WallReflectance(SmoothEffect):
     coefficients = "gain_map"
 
     @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
+    def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
         return over_wall(scan, 6)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("gain_map", "1", 0.0, 0.05, -1.0, 1.0, size=cls.basis(scan).shape[1]),)
+        return cls.coefficient(scan, "1", 0.05, 1.0, 0.5)
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         return signal * torch.exp(self.field(spots))[:, None]

@@ -89,8 +89,14 @@ def test_dependent_columns_do_not_break_the_projection():
     assert torch.allclose(Projector(problem(z[:, 0], twice)).off(z), Projector(problem(z[:, 0], x)).off(z), atol=1e-3)
 
 
+@pytest.fixture
+def no_priors(monkeypatch):
+    """Coefficients that are as free as their bounds."""
+    monkeypatch.setattr(screening, "PRIOR_SCALES", (1e6,))
+
+
 @pytest.mark.parametrize(("name", "k"), [("power_drift", 5), ("time_offset", 1)])
-def test_statistic_of_nothing_is_chi_squared(name, k):
+def test_statistic_of_nothing_is_chi_squared(name, k, no_priors):
     """Mean k and variance 2k within four standard errors; gains of nothing average to -½ Σ tr(F_b F₋b⁻¹) = -0.6 k."""
     found = [look(name, r) for r in residuals(torch.zeros(ROWS), seed=3)]
     statistics = np.array([c.statistic for c in found])
@@ -102,7 +108,19 @@ def test_statistic_of_nothing_is_chi_squared(name, k):
     assert abs(gains.mean() + 0.6 * k) < 4 * gains.std() / math.sqrt(DRAWS) + 0.1 * k
 
 
-def test_one_step_is_unbiased_and_its_error_right():
+def test_priors_cost_little_where_nothing_is_and_win_where_the_counts_say_little():
+    """The statistic is that of free coefficients; the predicted gain is that of steps which the prior holds back."""
+    draws = residuals(torch.zeros(ROWS), seed=3)
+    found = [look("power_drift", r) for r in draws]
+    assert np.mean([c.statistic for c in found]) == pytest.approx(5, abs=4 * math.sqrt(10 / DRAWS))
+    assert -0.4 * 5 < np.mean([c.gain for c in found]) < 0
+    assert all(c.effect.prior_scale in screening.PRIOR_SCALES for c in found)
+    steps = torch.stack([c.step for c in found])
+    z = Projector(problem(torch.zeros(ROWS))).off(columns(effect_of("power_drift", SCAN)))
+    assert torch.all(steps.std(0)[3:] < 0.1 * torch.linalg.inv(z.T @ z).diagonal().sqrt()[3:])  # the roughest two
+
+
+def test_one_step_is_unbiased_and_its_error_right(no_priors):
     effect = effect_of("power_drift", SCAN)
     truth = torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0])
     found = [look("power_drift", r) for r in residuals(columns(effect) @ truth, seed=4)]

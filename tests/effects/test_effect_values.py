@@ -172,13 +172,39 @@ def test_splines_sum_to_one_and_are_smooth():
     u = torch.linspace(-1, 1, 201, dtype=torch.float64)
     basis = spline_basis(u, 6)
     assert basis.sum(1) == pytest.approx(torch.ones(201), abs=1e-12)
-    functions = smooth_basis(u, 6)
+    functions, share = smooth_basis(u, 6)
     assert functions.shape == (201, 5)
     assert functions.T @ functions / 201 == pytest.approx(torch.eye(5, dtype=torch.float64), abs=1e-9)
     assert functions.mean(0).abs().max() < 1e-9
+    # Slopes fall as those of half and whole cosines do, as far as six splines follow them.
+    assert share[:3] == pytest.approx([1, 1 / 4, 1 / 9], rel=0.02)
+    assert share.diff().max() < 0
     # Few points: as many functions as they can tell apart.
-    assert smooth_map_basis(torch.rand(4, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1, 6).shape == (4, 3)
-    assert smooth_basis(torch.zeros(1), 6).shape == (1, 0)
+    assert smooth_map_basis(torch.rand(4, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1, 6)[0].shape == (4, 3)
+    assert smooth_basis(torch.zeros(1), 6)[0].shape == (1, 0)
+
+
+def test_smooth_maps_do_not_hang_on_rounding():
+    """On a square scan half-waves along x and along y would be equally smooth, and any mixture of them an answer."""
+    u = torch.linspace(-1, 1, 24, dtype=torch.float64)
+    place = torch.stack(torch.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2)
+    noise = torch.randn(place.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    functions, other = (smooth_map_basis(p, 6)[0] for p in (place, place + 1e-9 * noise))
+    assert functions.shape == (576, 35)
+    assert other == pytest.approx(functions, abs=1e-4)
+    assert functions[:, 0].view(24, 24).std(1).max() < 0.05  # along x alone
+
+
+def test_priors_count_nats():
+    drift = effect("power_drift")
+    assert drift.penalty().item() == 0
+    deviations = torch.tensor(drift.declared["drift"].prior)
+    drift.set("drift", torch.cat([2 * deviations[:1], deviations[1:2], 0 * deviations[2:]]))
+    assert drift.penalty().item() == pytest.approx((4 + 1) / 2, rel=1e-5)
+    drift.prior_scale = 0.5
+    assert drift.penalty().item() == pytest.approx(4 * (4 + 1) / 2, rel=1e-5)
+    assert drift.precision() == pytest.approx((0.05 / (0.5 * deviations)) ** 2, rel=1e-5)
+    assert float(effect("irf_tail").precision().sum()) == 0
 
 
 @pytest.mark.parametrize("kind", ["single", "exhaustive"])
