@@ -1,7 +1,7 @@
 """The blind benchmark: hide effects in captures, diagnose the files, count what was found: ``python benchmarks/blind.py table``.
 
     python benchmarks/blind.py cases                the small seeded set that tests use a part of
-    python benchmarks/blind.py table count=120      nulls, single effects, pairs, unknowns
+    python benchmarks/blind.py table                nulls, single effects, pairs, unknowns; some 2 hours of 2 cores
     python benchmarks/blind.py report               docs/blind.md from what has been run so far
 
 Every diagnosis is stored as it is done (benchmarks/results/blind/), so that an interrupted run goes on where it was.
@@ -19,22 +19,38 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind"), str(ROOT / "benchmarks")]
 STORE = ROOT / "benchmarks" / "results" / "blind"
-SHARES = {"null": 0.42, "single": 0.38, "pair": 0.08, "unknown": 0.12}
 MARK = "<!-- measured: python benchmarks/blind.py report -->"
-SCENES = ("default", "letters", "z_confocal")
+SCENES = ("default", "letters", "z_confocal", "sphere_before_plate", "corner")
 
 
-def table(count: int) -> dict[str, object]:
-    """``count`` drawn captures by name; kinds interleaved, so that a part of the run is a fair sample."""
-    from blind_truth import LEVELS, draw_spec
+def table() -> dict[str, object]:
+    """The captures by name, in such an order that a part of the run is a fair sample of the whole.
 
-    specs, done = {}, dict.fromkeys(SHARES, 0)
-    for k in range(count):
-        kind = min(SHARES, key=lambda name: (done[name] + 1) / SHARES[name])
-        done[kind] += 1
-        strengths = (1, 2, 3) if kind in ("pair", "unknown") else (0, 1, 2, 3)
-        specs[f"{k:03d}_{kind}"] = draw_spec(1000 + k, kind, scenes=SCENES, strengths=strengths, levels=LEVELS)
-    return specs
+    44 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 14 pairs, every unknown thrice; scenes
+    and photon levels in turn.
+    """
+    from blind_inject import EFFECTS, UNKNOWN
+    from blind_truth import LEVELS, STRENGTHS, draw_spec
+
+    table_of = EFFECTS | UNKNOWN
+    steps = range(len(STRENGTHS))
+    kinds = {
+        "null": [((), ())] * 44,
+        "single": [((name,), ((k + 2 * again) % 4,)) for again in (0, 1) for k, name in enumerate(EFFECTS)],
+        "pair": [(None, tuple(steps[1:]))] * 14,
+        "unknown": [((name,), (strength,)) for strength in (2, 3, 1) for name in UNKNOWN],
+    }
+    drawn = []
+    for kind, wanted in kinds.items():
+        for k, (names, strengths) in enumerate(wanted):
+            level, seed = LEVELS[(k + k // len(LEVELS)) % len(LEVELS)], 1000 * (1 + list(kinds).index(kind)) + k
+            fitting = (
+                [s for s in SCENES if all(s in (table_of[n].scenes or SCENES) for n in names or ())] if names else list(SCENES)
+            )
+            scenes = (fitting[k % len(fitting)],) if kind != "pair" else SCENES
+            spec = draw_spec(seed, kind, effects=names or None, scenes=scenes, strengths=strengths or tuple(steps), levels=(level,))
+            drawn.append(((k + 0.5) / len(wanted), f"{kind}_{k:02d}", spec))
+    return {name: spec for _, name, spec in sorted(drawn, key=lambda entry: entry[0])}
 
 
 def work(name: str, spec: object) -> str:
@@ -78,7 +94,7 @@ def main(arguments: list[str]) -> None:
 
         run({f"case_{name.replace(' ', '_').replace(',', '')}": spec for name, spec in CASES.items()})
     elif what == "table":
-        run(table(int(given.get("count", 96))))
+        run(table(), int(given.get("processes", 2)))
     elif what == "report":
         from blind_report import tables
 

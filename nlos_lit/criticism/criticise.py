@@ -39,6 +39,7 @@ class CriticismSettings:
         least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
         rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds;
             the one that was screened best is always among them.
+        hopeless: share of the best predicted gain below which an effect is no rival.
         far_off: misfit over noise from which on single-path effects are finalists whatever their score.
         similar: correlation of projected sensitivities from which on two effects are one group.
         steps: batches of a refit (and as many again at falling rate).
@@ -51,10 +52,11 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 1e-3
     least_gain: float = 25.0
-    least_share: float = 0.04
+    least_share: float = 0.025
     rivals: int = 5
+    hopeless: float = 0.2
     finalists: int = 3
-    far_off: float = 0.08
+    far_off: float = 0.15
     similar: float = 0.9
     steps: int = 60
     most: int = 5
@@ -124,7 +126,8 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         return Trial(candidate, again, compare(reference, likelihood, block), likelihood)
 
     trials = []
-    for candidate in wanted[: s.rivals]:
+    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
+    for candidate in rivals:
         tell(f"refitting with {candidate.effect.name}")
         trials.append(trial(candidate, refit_with(fit, [candidate], s.steps, seed)))
     trials.sort(key=lambda t: -t.gain.nats)

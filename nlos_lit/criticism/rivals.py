@@ -11,6 +11,8 @@ from nlos_lit.criticism.refit import Comparison, compare
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.surfel_fit import SurfelFit
 
+NEARLY = 0.8  # share of the best rival's predicted gain from which on fewer parameters count as a virtue
+
 
 @dataclass(frozen=True)
 class Trial:
@@ -35,12 +37,16 @@ def best_of_each(trials: list[Trial]) -> list[Trial]:
 
 
 def choose(trials: list[Trial], block: np.ndarray) -> Trial:
-    """The best rival, or the one with fewest parameters among those that cannot be told from it (one standard error)."""
+    """The best rival, or the one with fewest parameters among those that cannot be told from it.
+
+    That is: within one standard error on the select spots, and with nearly the predicted gain of the best on the fitted ones.
+    """
     best = trials[0]
 
     def close(trial: Trial) -> bool:
         short = compare(trial.likelihood, best.likelihood, block)
-        return short.nats < max(short.error, 0.02 * best.gain.nats)
+        predicted = trial.candidate.gain > NEARLY * best.candidate.gain
+        return predicted and short.nats < max(short.error, 0.02 * best.gain.nats)
 
     near = [t for t in trials if t is best or close(t)]
     return min(near, key=lambda t: (t.candidate.degrees, -t.gain.nats))

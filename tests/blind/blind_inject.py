@@ -267,7 +267,7 @@ class Kind:
 OWN = ("default", "letters", "sphere_before_plate", "corner")
 EFFECTS: dict[str, Kind] = {
     "retroreflection": Kind(retroreflection, (3.8, 3.5, 3.0, 2.0), (*OWN, "z_confocal", "bunny_confocal")),
-    "specular_lobe": Kind(specular_lobe, (0.1, 0.3, 1.0, 3.0), OWN),
+    "specular_lobe": Kind(specular_lobe, (0.01, 0.03, 0.1, 0.4), OWN),
     "occlusion": Kind(occlusion, (0.1, 0.25, 0.5, 1.0), OWN),
     "higher_order_bounces": Kind(higher_order_bounces, (0.01, 0.03, 0.08, 0.2), ("corner", "bunny_confocal")),
     "time_offset": Kind(time_offset, (0.5, 1.0, 3.0, 6.0)),

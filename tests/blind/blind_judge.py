@@ -36,6 +36,7 @@ class Outcome:
         named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control on spots that neither
             fitted, scaled to the number of fitted spots. gain, oracle: nats on the select spots.
         errors: per true quantity, (found - true)/stderr and found/true - 1.
+        screened: the six best of the first screening: name, statistic, predicted gain (nats), retained information.
     """
 
     spec: dict
@@ -51,6 +52,7 @@ class Outcome:
     errors: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     values: dict[str, dict[str, float]] = field(default_factory=dict)
     found: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
+    screened: list[tuple[str, float, float, float]] = field(default_factory=list)
     ratio: float = 1.0
     seconds: float = 0.0
 
@@ -110,14 +112,13 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         errors=parameter_errors(truth, diagnosis),
         values=truth.values,
         found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
+        screened=[(c.name, c.statistic, c.predicted_gain, c.retained_information) for c in diagnosis.screened[:6]],
         ratio=diagnosis.base.deviance_per_bin / diagnosis.base.deviance_noise,
         seconds=diagnosis.seconds,
     )
 
 
-def oracle_gain(
-    truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
-) -> float:
+def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor) -> float:
     """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]

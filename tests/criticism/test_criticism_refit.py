@@ -116,6 +116,9 @@ def test_fewest_parameters_win_a_tie():
     # A hundredth of a large gain is no reason for more parameters.
     small = trial("vignetting", best - per_spot(0.03, 0.001, seed=1), 236.4)
     assert choose([wide, small], BLOCK) is small
+    # Nor are spots that settle little, where the many fitted ones say more.
+    said = replace(near, candidate=candidate("vignetting", gain=50.0))
+    assert choose([wide, said, far], BLOCK) is wide
     # A number a spot counts as two: width and share.
     jitter = trial("timing_jitter", best, 240)
     assert choose([wide, jitter, replace(near, likelihood=best - 1)], BLOCK) is jitter

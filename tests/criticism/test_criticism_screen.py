@@ -117,7 +117,7 @@ def test_priors_cost_little_where_nothing_is_and_win_where_the_counts_say_little
     assert all(c.effect.prior_scale in screening.PRIOR_SCALES for c in found)
     steps = torch.stack([c.step for c in found])
     z = Projector(problem(torch.zeros(ROWS))).off(columns(effect_of("power_drift", SCAN)))
-    assert torch.all(steps.std(0)[3:] < 0.1 * torch.linalg.inv(z.T @ z).diagonal().sqrt()[3:])  # the roughest two
+    assert torch.all(steps.std(0)[3:] < 0.2 * torch.linalg.inv(z.T @ z).diagonal().sqrt()[3:])  # the roughest two
 
 
 def test_one_step_is_unbiased_and_its_error_right(no_priors):
