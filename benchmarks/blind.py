@@ -26,8 +26,8 @@ SCENES = ("default", "letters", "z_confocal", "sphere_before_plate", "corner")
 def table() -> dict[str, object]:
     """The captures by name, in such an order that a part of the run is a fair sample of the whole.
 
-    44 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 14 pairs, every unknown thrice; scenes
-    and photon levels in turn.
+    44 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 14 pairs, every unknown thrice;
+    scenes and photon levels in turn.
     """
     from blind_inject import EFFECTS, UNKNOWN
     from blind_truth import LEVELS, STRENGTHS, draw_spec

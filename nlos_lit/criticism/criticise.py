@@ -52,7 +52,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 1e-3
     least_gain: float = 25.0
-    least_share: float = 0.025
+    least_share: float = 0.03
     rivals: int = 5
     hopeless: float = 0.2
     finalists: int = 3
