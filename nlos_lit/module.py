@@ -8,8 +8,8 @@ import lightning as L
 import torch
 from torch import Tensor
 
-from nlos_lit.losses import albedo_variation, sparsity, transient_loss
 from nlos_lit.metrics import expected_deviance, nmse_noise_floor, poisson_deviance
+from nlos_lit.objective import Objective, adam, parameter_groups
 from nlos_lit.pipeline import Pipeline
 
 
@@ -44,14 +44,9 @@ class SelfCalibration(L.LightningModule):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.pipeline, self.scale, self.rates = pipeline, scale, rates
-        self.lambda_sparsity, self.lambda_albedo = lambda_sparsity, lambda_albedo
-        self.albedo_planes, self.clip, self.seed = albedo_planes, clip, seed
-        self.groups = {
-            "phasor": [pipeline.phasor.omega_pf.raw, pipeline.phasor.sigma_pf.raw],
-            "sensor": list(pipeline.laser_sensor.parameters()),
-            "albedo": list(pipeline.albedo.parameters()),
-        }
+        self.pipeline, self.scale, self.rates, self.clip = pipeline, scale, rates, clip
+        self.criterion = Objective(scale, lambda_sparsity, lambda_albedo, albedo_planes, seed)
+        self.groups = parameter_groups(pipeline)
         for name, parameters in self.groups.items():
             for parameter in parameters:
                 parameter.requires_grad_(optimise[name])
@@ -73,18 +68,11 @@ class SelfCalibration(L.LightningModule):
 
     def objective(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """Loss terms of a batch: ``spots`` ``[S]`` and gated ``counts`` ``[S, T]``."""
-        rendering = self.pipeline(batch["spots"])
-        terms = {"transient": transient_loss(batch["counts"] / self.scale, rendering.expected / self.scale)}
-        terms |= self.regularisation(rendering.intensity, self._voxel_batch(rendering.albedo))
-        terms["loss"] = terms["transient"] + terms["sparsity"] + terms["albedo"]
-        return terms
+        return self.criterion.terms(self.pipeline, batch["spots"], batch["counts"], self.global_step)
 
     def regularisation(self, intensity: Tensor, albedo: Tensor) -> dict[str, Tensor]:
         """E_Ipf and E_ρ with their factors, over a volume and (planes of) an albedo volume."""
-        return {
-            "sparsity": self.lambda_sparsity * sparsity(intensity),
-            "albedo": self.lambda_albedo * albedo_variation(albedo),
-        }
+        return self.criterion.regularisation(intensity, albedo)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> dict[str, Tensor]:
         terms = self.objective(batch)
@@ -112,7 +100,7 @@ class SelfCalibration(L.LightningModule):
         return self._finish_score()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.Adam([{"params": self.groups[name], "lr": self.rates[name], "name": name} for name in self.optimised])
+        return adam(self.pipeline, self.rates, self.optimised)
 
     def configure_gradient_clipping(self, optimizer: torch.optim.Optimizer, *_: Any, **__: Any) -> None:
         if self.clip is not None:
@@ -123,13 +111,6 @@ class SelfCalibration(L.LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.scores = checkpoint["scores"]
-
-    def _voxel_batch(self, albedo: Tensor) -> Tensor:
-        planes = albedo.shape[0]
-        if self.albedo_planes is None or self.albedo_planes >= planes:
-            return albedo
-        generator = torch.Generator().manual_seed(self.seed + 7919 * self.global_step)
-        return albedo[torch.randperm(planes, generator=generator)[: self.albedo_planes].to(albedo.device)]
 
     def _add_score(self, batch: dict[str, Tensor]) -> None:
         counts, expected = batch["counts"], self.pipeline(batch["spots"]).expected

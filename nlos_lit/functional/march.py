@@ -62,19 +62,31 @@ def trilinear(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
 
 @torch.no_grad()
 def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
-    """:func:`trilinear` without gradients, several times faster: the interpolation is fused into one kernel.
+    """:func:`trilinear` without gradients, several times faster: the interpolation is fused into one kernel."""
+    scale, shift = unit_scale(lattice)
+    return sample_unit(volume, ((points - lattice.origin) * scale + shift)[:, [1, 0, 2]])
+
+
+def unit_scale(lattice: Lattice) -> tuple[Tensor, Tensor]:
+    """Factor and summand that bring (x, y, z) relative to the lattice's origin into [-1, 1]."""
+    cells = [max(lattice.shape[1] - 1, 1), max(lattice.shape[2] - 1, 1), max(lattice.shape[0] - 1, 1)]
+    single = [-1.0 if n > 1 else 0.0 for n in (lattice.shape[1], lattice.shape[2], lattice.shape[0])]
+    return 2 / (lattice.pitch * lattice.pitch.new_tensor(cells)), lattice.pitch.new_tensor(single)
+
+
+def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
+    """Values of ``volume`` ``[nz, nx, ny]`` at ``[M, 3]`` (y, x, z) in [-1, 1]; beyond, those of the border.
 
     The kernel is parallel over its batch only, so the points are dealt into as many batches as keep all threads busy.
     """
-    nz, nx, ny = lattice.shape
     batches = 4 * torch.get_num_threads() if volume.device.type == "cpu" else 1
-    size = torch.tensor([nx, ny, nz], device=points.device, dtype=points.dtype) - 1
-    unit = (points - lattice.origin) / (lattice.pitch * size.clamp_min(1)) * 2 - 1
-    missing = -len(unit) % batches
-    unit = torch.nn.functional.pad(unit[:, [1, 0, 2]], (0, 0, 0, missing)).view(batches, 1, 1, -1, 3)
-    field = volume[None, None].expand(batches, 1, nz, nx, ny)
-    values = torch.nn.functional.grid_sample(field, unit, align_corners=True, padding_mode="border").reshape(-1)
-    return values[: len(points)]
+    count = len(unit)
+    missing = -count % batches
+    if missing:
+        unit = torch.cat([unit, unit[:1].expand(missing, 3)])
+    field = volume[None, None].expand(batches, 1, *volume.shape)
+    grid = unit.view(batches, 1, 1, -1, 3)
+    return torch.nn.functional.grid_sample(field, grid, align_corners=True, padding_mode="border").reshape(-1)[:count]
 
 
 def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
@@ -105,7 +117,7 @@ def march(
     step: float,
     reach: float,
     fine: int = 1,
-    chunk: int = 1 << 20,
+    chunk: int = 1 << 17,
 ) -> Samples:
     """Find, on every ray that meets the threshold, the samples that decide where its surface lies.
 
@@ -136,24 +148,31 @@ def march(
     # Opposite corners; neighbours share the very same number, so that a sample on a face belongs to one brick only.
     start = lattice.origin + cells * edge * lattice.pitch
     end = lattice.origin + torch.minimum((cells + 1) * edge, last) * lattice.pitch
+    world = torch.einsum("sij,rj->sri", frames, rays).reshape(-1, 3)
+    inverse = 1 / torch.where(world.abs() < 1e-12, torch.full_like(world, 1e-12), world)
+    # Boxes as seen from each wall point: every pair of ray and brick is clipped with two look-ups.
+    boxes = torch.cat([start - origins[:, None], end - origins[:, None]], dim=2).reshape(-1, 6)
+    scale, shift = unit_scale(lattice)
+    turned = [1, 0, 2]
+    unit_origin, unit_world = ((origins - lattice.origin) * scale + shift)[:, turned], (world * scale)[:, turned]
     peak = torch.zeros(origins.shape[0] * n * n, device=device)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
-    for spot, brick, ray in _candidates(cells, extent, lattice.origin, origins, frames, rays, n, chunk):
-        direction = torch.einsum("sij,sj->si", frames[spot], rays[ray])
-        near, far = _clip(origins[spot], direction, start[brick], end[brick])
-        first = torch.ceil(near / step - 0.5).clamp_min(0)
-        count = (torch.ceil(far / step - 0.5) - first).clamp_min(0).long()
+    for pair, line in _candidates(cells, extent, lattice.origin, origins, frames, n, chunk):
+        near, far = _clip(boxes.index_select(0, pair), inverse.index_select(0, line))
+        first = torch.ceil(near / step - 0.5).clamp_min_(0)
+        count = (torch.ceil(far / step - 0.5) - first).clamp_min_(0)
         meets = torch.nonzero(count).squeeze(1)
-        for part in _split_by_total(count[meets], chunk):
-            pick = meets[part]
-            owner, rank = expand(count[pick])
-            distance = (first[pick][owner] + rank + 0.5) * step
-            points = origins[spot[pick]][owner] + distance[:, None] * direction[pick][owner]
-            value = sample(volume, points, lattice)
+        first, count, line = first.index_select(0, meets), count.index_select(0, meets).long(), line.index_select(0, meets)
+        chords = torch.cat([unit_origin[line // (n * n)], unit_world.index_select(0, line), first[:, None]], dim=1)
+        for part in _split_by_total(count, chunk):
+            owner, rank = expand(count[part])
+            chord = chords[part].index_select(0, owner)
+            distance = (chord[:, 6] + rank + 0.5) * step
+            value = sample_unit(volume, torch.addcmul(chord[:, :3], distance[:, None], chord[:, 3:6]))
             above = torch.nonzero(value >= threshold).squeeze(1)
-            line = (spot[pick] * n * n + ray[pick])[owner[above]]
-            peak.scatter_reduce_(0, line, value[above], "amax")
-            kept.append((line, distance[above], value[above]))
+            value, on = value[above], line[part].index_select(0, owner[above])
+            peak.scatter_reduce_(0, on, value, "amax")
+            kept.append((on, distance[above], value))
     if not kept:
         empty = torch.zeros(0, dtype=torch.long, device=device)
         return Samples(empty, empty, empty, torch.zeros(0, device=device))
@@ -181,8 +200,8 @@ def expand(counts: Tensor) -> tuple[Tensor, Tensor]:
     return owner, torch.arange(len(owner), device=counts.device) - start[owner]
 
 
-def _candidates(cells, extent, origin, origins, frames, rays, n, chunk):
-    """Yield (spot, brick, ray) triples that contain every ray through every brick.
+def _candidates(cells, extent, origin, origins, frames, n, chunk):
+    """Yield pairs spot·bricks + brick with rays spot·n² + ray that contain every ray through every brick.
 
     A brick lies in a cone of half-angle α about its centre; the concentric map stretches by at most ``LIPSCHITZ``, so its rays
     lie within ``LIPSCHITZ·α`` of the centre's coordinates in the square. A centre below the horizon is first moved to the
@@ -207,20 +226,19 @@ def _candidates(cells, extent, origin, origins, frames, rays, n, chunk):
     counts = (width[..., 0] * width[..., 1]).reshape(-1)
     occupied = torch.nonzero(counts).squeeze(1)
     low, width = low.reshape(-1, 2), width.reshape(-1, 2)
-    n_bricks = cells.shape[0]
+    spot = torch.arange(len(low), device=low.device) // cells.shape[0]
+    corners = spot * (n * n) + low[:, 0] * n + low[:, 1]
     for part in _split_by_total(counts[occupied], chunk):
         pair = occupied[part]
         owner, rank = expand(counts[pair])
-        pair = pair[owner]
-        row = low[pair, 0] + rank // width[pair, 1]
-        column = low[pair, 1] + rank % width[pair, 1]
-        yield pair // n_bricks, pair % n_bricks, row * n + column
+        columns, corner = width[pair, 1][owner], corners[pair][owner]
+        row = torch.div(rank, columns, rounding_mode="floor")
+        yield pair[owner], corner + row * n + (rank - row * columns)
 
 
-def _clip(origin: Tensor, direction: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit distance of rays through axis-aligned boxes; entry ≥ exit where a ray misses."""
-    tiny = torch.where(direction.abs() < 1e-12, torch.full_like(direction, 1e-12), direction)
-    one, two = (low - origin) / tiny, (high - origin) / tiny
+def _clip(box: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
+    """Entry and exit distance of rays with ``inverse`` directions through boxes given by opposite corners; entry ≥ exit: a miss."""
+    one, two = box[:, :3] * inverse, box[:, 3:] * inverse
     return torch.minimum(one, two).amax(1), torch.maximum(one, two).amin(1)
 
 
