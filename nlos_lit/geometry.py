@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -9,11 +10,15 @@ from torch import Tensor, nn
 
 from nlos_lit.functional.concentric import ray_grid, wall_frame
 from nlos_lit.functional.march import Lattice, Samples, march, trilinear
+from nlos_lit.functional.static import Capacity, StaticSamples, static_march
 from nlos_lit.grid import VolumeGrid
 
 
 class Surface(NamedTuple):
-    """Surface points x_g found along rays from a batch of S wall points; K of the S·n² rays met something."""
+    """Surface points x_g found along rays from a batch of S wall points; K of the S·n² rays met something.
+
+    On a GPU K is a capacity: rows that no ray needed have a zero normal, and so contribute nothing.
+    """
 
     spot: Tensor  # [K] index into the batch
     distance: Tensor  # [K] d_gs, m
@@ -35,6 +40,8 @@ class ImplicitGeometry(nn.Module):
             quantised to half a bin.
         relative: β applies to intensities relative to the ray's largest, so that weak surfaces are located as sharply as
             strong ones; False applies it to the intensities themselves, as the paper does.
+        static: march with tensors of fixed size, so that a GPU never waits for the host; None does so on accelerators.
+            Needs ``fine > 1``: the samples that the paper's softargmax looks at can be any number.
     """
 
     def __init__(
@@ -47,8 +54,12 @@ class ImplicitGeometry(nn.Module):
         beta: float = 1e3,
         fine: int = 1,
         relative: bool = False,
+        static: bool | None = None,
     ) -> None:
         super().__init__()
+        self.wants_static, self.pitch_m = static, grid.pitch
+        self.capacity: tuple[float, float] | None = None  # blocks and rays a spot that there is room for
+        self.register_buffer("needed", torch.zeros(2), persistent=False)  # blocks and rays a spot
         self.side, self.threshold, self.step, self.beta = rays, threshold, step, beta
         self.fine, self.relative = fine, relative
         self.shape = grid.shape
@@ -63,6 +74,8 @@ class ImplicitGeometry(nn.Module):
     def forward(self, intensity: Tensor, origins: Tensor, normals: Tensor) -> Surface:
         """Args: intensity ``[nz, nx, ny]``, unit maximum; origins, normals ``[S, 3]`` of the wall points."""
         frames = wall_frame(normals)
+        if self.static:
+            return self._static(intensity, origins, frames)
         # Weights below e^{-17} ≈ 4e-8 of the largest vanish in float32.
         samples = march(
             intensity.detach(),
@@ -81,35 +94,93 @@ class ImplicitGeometry(nn.Module):
         normal, valid = self._normals(point, direction, samples, origins.shape[0])
         return Surface(samples.spot[valid], distance[valid], direction[valid], point[valid], normal[valid])
 
-    def _softargmax(self, intensity: Tensor, samples: Samples, origins: Tensor, direction: Tensor) -> Tensor:
-        """``Σ ω_i d_i / Σ ω_i`` with ``ω_i = e^{β I_i}`` per hit ray ``[K]``."""
+    @property
+    def static(self) -> bool:
+        wanted = self.origin.device.type != "cpu" if self.wants_static is None else self.wants_static
+        return wanted and self.fine > 1
+
+    def renew_capacity(self) -> bool:
+        """Make room for half as much again as was needed since the last call; True if there was too little, so rays were lost.
+
+        Waits for the device; does nothing on a CPU.
+        """
+        if not self.static or self.capacity is None:
+            return False
+        needed = self.needed.tolist()
+        lost = any(n > had for n, had in zip(needed, self.capacity, strict=True))
+        self.capacity = tuple(1.5 * n + 64 for n in needed)
+        self.needed.zero_()
+        return lost
+
+    def _static(self, intensity: Tensor, origins: Tensor, frames: Tensor) -> Surface:
+        n_rays = self.side**2
+        world = torch.einsum("sij,rj->sri", frames, self.rays)
+        spots = len(origins)
+        capacity = None if self.capacity is None else Capacity(*(math.ceil(n * spots) for n in self.capacity))
+        found = static_march(
+            intensity.detach(),
+            self.lattice,
+            self.pitch_m,
+            origins,
+            world,
+            threshold=self.threshold,
+            step=self.step,
+            fine=self.fine,
+            capacity=capacity,
+        )
+        torch.maximum(self.needed, found.needed / spots, out=self.needed)
+        if capacity is None:
+            self.capacity = (0.0, 0.0)
+            self.renew_capacity()
+        spot, ray = found.line // n_rays, found.line % n_rays
+        direction = world.reshape(-1, 3)[found.line]
+        width = found.distance.shape[1]
+        hit = torch.arange(len(spot), device=spot.device)[:, None].expand(-1, width).reshape(-1)
+        samples = Samples(spot, ray, hit, found.distance.reshape(-1))
+        distance = self._softargmax(intensity, samples, origins, direction, found)
+        point = origins[spot] + distance[:, None] * direction
+        normal, valid = self._normals(point, direction, samples, origins.shape[0], found.used)
+        return Surface(spot, distance, direction, point, torch.where((valid & found.used)[:, None], normal, 0.0))
+
+    def _softargmax(
+        self, intensity: Tensor, samples: Samples, origins: Tensor, direction: Tensor, static: StaticSamples | None = None
+    ) -> Tensor:
+        """``Σ ω_i d_i / Σ ω_i`` with ``ω_i = e^{β I_i}`` per hit ray ``[K]``; of ``static`` samples those that mean something."""
         hits = samples.spot.shape[0]
         at = origins[samples.spot[samples.hit]] + samples.distance[:, None] * direction[samples.hit]
         value = trilinear(intensity, at, self.lattice)
+        if static is not None:
+            value = torch.where(static.used[:, None], torch.where(static.inside, value.view_as(static.inside), 0.0), 1.0).view(-1)
         # With a relative β the largest intensity scales the exponent, so the gradient passes through it; otherwise it cancels.
         largest = value if self.relative else value.detach()
         top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(0, samples.hit, largest, "amax")
         sharpness = self.beta / top if self.relative else self.beta * torch.ones_like(top)
         weight = torch.exp(sharpness[samples.hit] * (value - top[samples.hit]))
+        if static is not None:
+            weight = torch.where(static.inside, weight.view_as(static.inside), 0.0).view(-1)
         zeros = torch.zeros(hits, device=value.device)
         total = zeros.index_add(0, samples.hit, weight)
         # Relative to the first sample, so that float32 keeps the sub-step digits.
         base = zeros.scatter_reduce(0, samples.hit, samples.distance, "amin", include_self=False)
         return base + zeros.index_add(0, samples.hit, weight * (samples.distance - base[samples.hit])) / total
 
-    def _normals(self, point: Tensor, direction: Tensor, samples: Samples, n_spots: int) -> tuple[Tensor, Tensor]:
+    def _normals(
+        self, point: Tensor, direction: Tensor, samples: Samples, n_spots: int, used: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Unit normals ``[K, 3]`` and which hits have one.
 
         The paper sums the normals of the triangles N-E-S and S-W-N of the neighbouring rays' points, which is
         ``(E - W) × (S - N)``. A neighbour that met no surface is replaced by the point itself (a one-sided difference);
-        a hit without any neighbour along one of the two directions has no normal and is treated as no surface.
+        a hit without any neighbour along one of the two directions has no normal and is treated as no surface. Rows that are not
+        ``used`` are nobody's neighbours.
         """
         n = self.side
-        table = torch.full((n_spots * n * n,), -1, dtype=torch.long, device=point.device)
+        rays = n_spots * n * n
+        table = torch.full((rays + 1,), -1, dtype=torch.long, device=point.device)  # the last row for what is not used
         row, column = samples.ray // n, samples.ray % n
         line = samples.spot * n * n
         own = torch.arange(len(row), device=point.device)
-        table[line + samples.ray] = own
+        table.scatter_(0, line + samples.ray if used is None else torch.where(used, line + samples.ray, rays), own)
 
         def neighbour(di: int, dj: int) -> Tensor:
             i, j = row + di, column + dj

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 import lightning as L
@@ -11,6 +12,8 @@ from torch import Tensor
 from nlos_lit.metrics import expected_deviance, nmse_noise_floor, poisson_deviance
 from nlos_lit.objective import Objective, adam, parameter_groups
 from nlos_lit.pipeline import Pipeline
+
+log = logging.getLogger(__name__)
 
 
 class SelfCalibration(L.LightningModule):
@@ -76,6 +79,8 @@ class SelfCalibration(L.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> dict[str, Tensor]:
         terms = self.objective(batch)
+        if self.global_step % 10 == 0 and self.pipeline.geometry.renew_capacity():
+            log.warning("iteration %d: more rays met a surface than there was room for; some were left out", self.global_step)
         for name, value in terms.items():
             label = "loss/total" if name == "loss" else f"loss/{name}"
             self.log(label, value.detach(), on_step=False, on_epoch=True, sync_dist=True, batch_size=1)

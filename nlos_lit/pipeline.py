@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -42,6 +43,8 @@ class Pipeline(nn.Module):
         self.phasor, self.geometry, self.albedo = phasor, geometry, albedo
         self.renderer, self.laser_sensor = renderer, laser_sensor
         self.gate = capture.gate
+        where = np.concatenate([capture.sensor, capture.sensor_normal], axis=1)
+        self.one_sensor = bool((where == where[0]).all())
         for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
             self.register_buffer(name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False)
 
@@ -54,6 +57,8 @@ class Pipeline(nn.Module):
 
     def surface(self, intensity: Tensor, sensor: Tensor, normal: Tensor) -> Surface:
         """The surface seen from each of ``sensor`` ``[S, 3]``; points that occur several times are marched from once."""
+        if self.geometry.static:  # without asking the device which points are equal
+            return self._from_one(intensity, sensor, normal) if self.one_sensor else self.geometry(intensity, sensor, normal)
         places, which = torch.unique(torch.cat([sensor, normal], dim=1), dim=0, return_inverse=True)
         if len(places) == len(sensor):
             return self.geometry(intensity, sensor, normal)
@@ -64,6 +69,12 @@ class Pipeline(nn.Module):
         spot, rank = expand(counts[which])
         row = order[start[which][spot] + rank]
         return Surface(spot, *(field[row] for field in seen[1:]))
+
+    def _from_one(self, intensity: Tensor, sensor: Tensor, normal: Tensor) -> Surface:
+        """The surface for spots that all are seen from the same point."""
+        seen, spots = self.geometry(intensity, sensor[:1], normal[:1]), len(sensor)
+        spot = torch.arange(spots, device=sensor.device)[:, None].expand(-1, len(seen.spot)).reshape(-1)
+        return Surface(spot, *(field.repeat(spots, *[1] * (field.dim() - 1)) for field in seen[1:]))
 
     def render(self, intensity: Tensor, albedo: Tensor, spots: Tensor) -> tuple[Tensor, Surface, Tensor]:
         """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given volume."""

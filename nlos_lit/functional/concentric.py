@@ -43,9 +43,8 @@ def ray_grid(n: int, device: torch.device | str = "cpu") -> Tensor:
 
 def wall_frame(normal: Tensor) -> Tensor:
     """``[S, 3, 3]`` rotations from a wall point's local frame (z along its normal) to the world; identity for a normal +z."""
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=normal.dtype, device=normal.device).expand_as(normal)
-    side = torch.tensor([1.0, 0.0, 0.0], dtype=normal.dtype, device=normal.device).expand_as(normal)
-    helper = torch.where(normal[:, 1:2].abs() < 0.9, up, side)
+    upright = (normal[:, 1:2].abs() < 0.9).to(normal.dtype)  # up (0, 1, 0) helps, else (1, 0, 0)
+    helper = torch.cat([1 - upright, upright, torch.zeros_like(upright)], dim=1)
     x = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=1)
     y = torch.linalg.cross(normal, x)
     return torch.stack([x, y, normal], dim=2)

@@ -8,6 +8,7 @@ above the threshold has a corner voxel above it and therefore lies in an occupie
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -39,12 +40,13 @@ def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     Points outside the lattice of voxel centres are clamped to its surface.
     """
     nz, nx, ny = lattice.shape
-    size = torch.tensor([nx, ny, nz], device=points.device)
+    size = constants((nx, ny, nz), points)
     position = (points - lattice.origin) / lattice.pitch
-    position = torch.minimum(position.clamp_min(0), (size - 1).to(points.dtype))
-    low = torch.minimum(position.floor().long(), (size - 2).clamp_min(0))
+    position = torch.minimum(position.clamp_min(0), size - 1)
+    low = torch.minimum(position.detach().floor(), (size - 2).clamp_min(0))
     part = position - low
-    high = torch.minimum(low + 1, size - 1)
+    low = low.long()
+    high = torch.minimum(low + 1, (size - 1).long())
     x = torch.stack([low[:, 0], high[:, 0]], 1)
     y = torch.stack([low[:, 1], high[:, 1]], 1)
     z = torch.stack([low[:, 2], high[:, 2]], 1)
@@ -69,9 +71,14 @@ def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
 
 def unit_scale(lattice: Lattice) -> tuple[Tensor, Tensor]:
     """Factor and summand that bring (x, y, z) relative to the lattice's origin into [-1, 1]."""
-    cells = [max(lattice.shape[1] - 1, 1), max(lattice.shape[2] - 1, 1), max(lattice.shape[0] - 1, 1)]
-    single = [-1.0 if n > 1 else 0.0 for n in (lattice.shape[1], lattice.shape[2], lattice.shape[0])]
-    return 2 / (lattice.pitch * lattice.pitch.new_tensor(cells)), lattice.pitch.new_tensor(single)
+    sizes = (lattice.shape[1], lattice.shape[2], lattice.shape[0])
+    cells = constants([max(n - 1, 1) for n in sizes], lattice.pitch)
+    return 2 / (lattice.pitch * cells), constants([-1.0 if n > 1 else 0.0 for n in sizes], lattice.pitch)
+
+
+def constants(values: Sequence[float], like: Tensor) -> Tensor:
+    """Numbers as a tensor, written by the device itself: a copy from the host would wait for it."""
+    return torch.stack([torch.full((), value, dtype=like.dtype, device=like.device) for value in values])
 
 
 def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
@@ -94,6 +101,11 @@ def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]
 
     A cell lies between neighbouring voxel centres; brick ``b`` holds cells ``b·size … (b+1)·size - 1``.
     """
+    return torch.nonzero(brick_mask(volume, threshold, size)[0, 0])
+
+
+def brick_mask(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
+    """``[1, 1, bz, bx, by]`` float, 1 where a brick of :func:`occupied_bricks` is occupied."""
     mask = (volume >= threshold).to(torch.float32)[None, None]
     nz, nx, ny = volume.shape
     cells = [max(n - 1, 1) for n in (nz, nx, ny)]
@@ -102,7 +114,7 @@ def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]
     mask = torch.nn.functional.pad(mask, (0, pad[2], 0, pad[1], 0, pad[0]))
     # A brick spans size + 1 voxels in each direction, sharing its faces' voxels with its neighbours.
     kernel = [s + 1 for s in size]
-    return torch.nonzero(torch.nn.functional.max_pool3d(mask, kernel, stride=size)[0, 0])
+    return torch.nn.functional.max_pool3d(mask, kernel, stride=size)
 
 
 @torch.no_grad()

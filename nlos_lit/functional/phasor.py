@@ -17,6 +17,8 @@ from torch import Tensor
 
 from nlos_lit.functional.even import EvenAxis, Rotation, even_transform, fold, inverse, mirror, polar, runs, unfold
 
+ROWS = 1 << 15  # of the field that are converted at once on a CPU
+
 
 def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> Tensor:
     """Spectrum of ``P(t) = e^{iΩ_pf t} e^{-t²/(2σ_pf²)}`` at frequencies ``omega`` ``[F]`` rad/m, scaled to a unit peak."""
@@ -189,7 +191,7 @@ class PhasorMagnitude(torch.autograd.Function):
         if field.dtype == weights.dtype:
             parts = (rows @ weights).view(voxels, 2)
         else:
-            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(1 << 15)]).view(voxels, 2)
+            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(ROWS)]).view(voxels, 2)
         magnitude = torch.linalg.vector_norm(parts, dim=1)
         ctx.save_for_backward(field, parts, magnitude)
         return magnitude
@@ -197,9 +199,16 @@ class PhasorMagnitude(torch.autograd.Function):
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[None, Tensor]:
         field, parts, magnitude = ctx.saved_tensors
+        if field.device.type != "cpu":  # what the host would have to wait for costs more than all voxels
+            pull = parts * torch.where(magnitude > 0, grad / magnitude, 0.0)[:, None]
+            rows = field.reshape(2 * len(field), -1)
+            if rows.dtype == parts.dtype:
+                return None, pull.view(-1) @ rows
+            pairs = zip(pull.view(-1).split(ROWS), rows.split(ROWS), strict=True)
+            return None, sum(part @ chunk.to(part.dtype) for part, chunk in pairs)
         touched = torch.nonzero((grad != 0) & (magnitude > 0)).squeeze(1)
         result = torch.zeros(field.shape[2], dtype=parts.dtype, device=parts.device)
-        for chunk in touched.split(1 << 15):
+        for chunk in touched.split(ROWS):
             pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
             result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(-1, len(result))
         return None, result
