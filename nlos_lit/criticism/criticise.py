@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from nlos_lit.criticism.rivals import Trial, best_of_each, choose, group_of
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import Split
+from nlos_lit.criticism.steps import Steps
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.scan import Scan
@@ -24,7 +26,6 @@ from nlos_lit.surfel_fit import SurfelFit
 log = logging.getLogger(__name__)
 WORK = 1e12  # multiplications of the nuisance columns with each other, some 40 s of one core
 WELL = 0.01  # retained information from which on an effect counts as well identifiable
-Tell = Callable[[str], None]
 Rebuild = Callable[[Extension], SurfelFit]
 
 
@@ -104,13 +105,16 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     return candidates, discrepancies(problem, projector, scan)
 
 
-def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell) -> Turn:
+def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
     Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
     """
-    tell("screening effects")
-    candidates, rest = look(fit, split, scan, s, seed)
+    number = len(fit.extension.effects) + 1
+    steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
+    candidates, rest = steps(
+        "screen", f"screening effects, turn {number}", f"turn{number}_screen", lambda: look(fit, split, scan, s, seed)
+    )
     (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
     wanted = significant(candidates, s, over)
@@ -118,30 +122,37 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
-    tell("refitting the control")
-    reference = control_likelihood(fit, split, s.steps, seed)
+    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
+    steps.plan(refit=1 + len(rivals), fit=min(s.finalists, len(rivals)))
+    reference = steps(
+        "refit", "refitting the control", f"turn{number}_control", lambda: control_likelihood(fit, split, s.steps, seed)
+    )
 
     def trial(candidate: Candidate, again: SurfelFit) -> Trial:
         likelihood = log_likelihood(again, split.select)
         return Trial(candidate, again, compare(reference, likelihood, block), likelihood)
 
     trials = []
-    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
     for candidate in rivals:
-        tell(f"refitting with {candidate.effect.name}")
-        trials.append(trial(candidate, refit_with(fit, [candidate], s.steps, seed)))
+        name = candidate.effect.name
+        again = steps(
+            "refit", f"refitting with {name}", f"turn{number}_refit_{name}", partial(refit_with, fit, [candidate], s.steps, seed)
+        )
+        trials.append(trial(candidate, again))
     trials.sort(key=lambda t: -t.gain.nats)
     finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is wanted[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
         finalists += [(c, copy_effects(fit.extension, [null_of(c.effect)])) for c in bending]
+    steps.plan(fit=len(finalists))
     for candidate, extension in finalists:
-        tell(f"rebuilding the scene with {candidate.effect.name}")
-        try:
-            trials.append(trial(candidate, rebuild(copy_effects(extension, []))))
-        except UserError as error:  # with this effect no surfel survives: it is not the one
-            tell(f"{candidate.effect.name} leaves nothing: {error}")
+        name = candidate.effect.name
+        again = steps(
+            "fit", f"rebuilding the scene with {name}", f"turn{number}_rebuild_{name}", partial(_rebuilt, rebuild, extension)
+        )
+        if again is not None:
+            trials.append(trial(candidate, again))
     trials = best_of_each(trials)
     if not trials:
         return Turn(candidates, rest, [], None, [])
@@ -149,6 +160,15 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested / 2:
         return Turn(candidates, rest, trials, None, [])
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
+
+
+def _rebuilt(rebuild: Rebuild, extension: Extension) -> SurfelFit | None:
+    """None: with these effects no surfel survives, so that they are not the ones."""
+    try:
+        return rebuild(copy_effects(extension, []))
+    except UserError as error:
+        log.info("a rebuild leaves nothing: %s", error)
+        return None
 
 
 def control_likelihood(fit: SurfelFit, split: Split, steps: int, seed: int) -> torch.Tensor:
@@ -213,7 +233,7 @@ class Findings:
 
 
 def criticise(
-    base: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, tell: Tell = log.debug
+    base: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps | None = None
 ) -> Findings:
     """Find out, one after the other, which effects the capture asks for.
 
@@ -221,36 +241,44 @@ def criticise(
         base: fitted to ``split.fit`` without effects.
         rebuild: a fit from new seeds with the given effects, begun at their present values: surfels that imitated an effect do not
             come back.
-        tell: what is being done now.
+        steps: says and keeps what is done.
     """
-    fit, turns = base, []
+    fit, turns, steps = base, [], steps or Steps()
     while True:
-        turns.append(turn(fit, rebuild, split, scan, s, seed, tell))
+        turns.append(turn(fit, rebuild, split, scan, s, seed, steps))
         best = turns[-1].accepted
         if best is None:
             break
         fit = best.fit
         if len(fit.extension.effects) == s.most:
-            candidates, rest = look(fit, split, scan, s, seed)
-            turns.append(Turn(candidates, rest, [], None, []))
+            last = steps("screen", "screening what is left", "last_screen", partial(look, fit, split, scan, s, seed))
+            turns.append(Turn(*last, [], None, []))
             break
-    fit = drop_needless(fit, split, s, seed, tell)
+    fit = drop_needless(fit, split, s, seed, steps)
     return Findings(base, fit, turns)
 
 
-def drop_needless(fit: SurfelFit, split: Split, s: CriticismSettings, seed: int, tell: Tell) -> SurfelFit:
+def drop_needless(fit: SurfelFit, split: Split, s: CriticismSettings, seed: int, steps: Steps) -> SurfelFit:
     """Backward: an effect accepted early may be explained by those that came later."""
     block = split.block[split.select]
     while len(fit.extension.effects) > 1:
-        reference = log_likelihood(refit_with(fit, [], s.steps, seed), split.select)
-        losses = []
-        for effect in fit.extension.effects:
-            tell(f"refitting without {effect.name}")
-            fewer = fit.copy(Extension([e for e in copy_effects(fit.extension, []).effects if e.name != effect.name]), seed)
-            fewer.run(1, steps=s.steps, settle=False)
+        names = [e.name for e in fit.extension.effects]
+        steps.plan(refit=len(names) + 1)
+        key = f"drop{len(names)}"
+        whole = steps("refit", "refitting with all effects", key, partial(refit_with, fit, [], s.steps, seed))
+        reference, losses = log_likelihood(whole, split.select), []
+        for name in names:
+            fewer = steps("refit", f"refitting without {name}", f"{key}_{name}", partial(_without, fit, name, s.steps, seed))
             losses.append((compare(log_likelihood(fewer, split.select), reference, block), fewer))
         least, fewer = min(losses, key=lambda entry: entry[0].nats)
         if least.nats > 2 * least.error:
             break
         fit = fewer
     return fit
+
+
+def _without(fit: SurfelFit, name: str, steps: int, seed: int) -> SurfelFit:
+    """Refitted without one of its effects."""
+    fewer = fit.copy(Extension([e for e in copy_effects(fit.extension, []).effects if e.name != name]), seed)
+    fewer.run(1, steps=steps, settle=False)
+    return fewer

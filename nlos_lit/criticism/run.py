@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from torch import Tensor
@@ -15,13 +14,13 @@ from nlos_lit.criticism.diagnosis import assemble
 from nlos_lit.criticism.numerics import numerics
 from nlos_lit.criticism.result import Diagnosis
 from nlos_lit.criticism.split import split_spots
+from nlos_lit.criticism.steps import Report, Steps
 from nlos_lit.criticism.toys import run_toys
 from nlos_lit.effects.base import Extension
 from nlos_lit.effects.scan import Scan
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
-
-Tell = Callable[[str], None]
+from nlos_lit.surfel_fit import SurfelFit
 
 
 def diagnose(
@@ -32,16 +31,17 @@ def diagnose(
     name: str,
     seed: int,
     image: tuple[Tensor, VolumeGrid] | None = None,
-    toys_folder: Path | None = None,
-    tell: Tell = lambda text: None,
+    folder: Path | None = None,
+    report: Report = lambda text, passed, left: None,
 ) -> tuple[Diagnosis, Findings]:
     """Fit, criticise, measure.
 
     Args:
         capture: raw counts; nothing else about the measurement is known.
         image: ``[nz, nx, ny]`` and its grid, where a run has made it already.
-        toys_folder: where toys are kept; needed with ``options.toys``.
-        tell: what is being done now.
+        folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same arguments goes on; needed
+            with ``options.toys``.
+        report: see :class:`~nlos_lit.criticism.steps.Steps`.
 
     Raises:
         UserError: the scan is too small to be split, the capture holds no counts but expectations, or no surface is found.
@@ -50,23 +50,26 @@ def diagnose(
     if not capture.is_counts:
         raise UserError("a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first")
     split, scan = split_spots(capture), Scan.of(capture)
-    tell(f"{len(split.fit)} spots to fit, {len(split.select)} to select, {len(split.test)} untouched")
+    steps = Steps(report, None if folder is None else folder / "steps")
+    steps.share({"capture": capture, "settings": pipeline.surfels})
+    steps.plan(image=image is None, fit=1 + options.finalists, screen=2, refit=1 + options.rivals, check=options.numerics)
     if image is None:
-        tell("imaging")
-        image = pipeline.image(capture)
+        image = steps("image", "imaging", "image", lambda: pipeline.image(capture))
+    base = steps("fit", "fitting the base", "base", lambda: pipeline.fit(capture, split, image, Extension([]), seed))
+    steps.share({"counts": base.counts, "grid": base.grid, "reserve": base.reserve})
 
-    def fit(extension: Extension):
-        return pipeline.fit(capture, split, image, extension, seed)
+    def rebuild(extension: Extension) -> SurfelFit:
+        again = pipeline.fit(capture, split, image, extension, seed)
+        again.counts = base.counts
+        return again
 
-    tell("fitting the base")
-    base = fit(Extension([]))
-    found = criticise(base, fit, split, scan, options, seed, tell)
+    found = criticise(base, rebuild, split, scan, options, seed, steps)
     null = None
     if options.toys:
-        null = run_toys(capture, base, pipeline, split, options, toys_folder, lambda done, of: tell(f"toy {done} of {of}"))
+        null = run_toys(capture, base, pipeline, split, options, folder / "toys", report)
     checks = {}
     if options.numerics:
-        tell("varying the numerics")
-        checks = numerics(pipeline, capture, split, image, base, seed)
+        steps.plan(check=1)
+        checks = steps("check", "varying the numerics", "numerics", lambda: numerics(pipeline, capture, split, image, base, seed))
     seconds = time.perf_counter() - began
     return assemble(capture, found, split, scan, options, null, checks, name, seconds, seed), found

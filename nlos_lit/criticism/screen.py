@@ -101,19 +101,20 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
         whole = (raw.T @ raw).double()
         total = f.sum(0)
         floor = torch.diag(1e-9 * whole.diagonal() + 1e-30)
-        free = torch.linalg.solve(total + floor, s.sum(0)).clamp(lower, upper)
-        statistic = float(2 * free @ s.sum(0) - free @ total @ free)
         gain, scale = max((_predicted(s, f, floor + torch.diag(prior / scale**2), lower, upper), scale) for scale in scales)
         if best is None or gain > best.gain:
             effect.prior_scale = scale
             known = total + floor + torch.diag(prior / scale**2)
             step = torch.linalg.solve(known, s.sum(0)).clamp(lower, upper)
+            free = torch.linalg.solve(total + floor, s.sum(0)).clamp(lower, upper)
+            # Bounds may spoil a free step whose coefficients balance one another: the held-back one then says more.
+            statistic = max(0.0, *(float(2 * t @ s.sum(0) - t @ total @ t) for t in (free, step)))
             retained = float(torch.linalg.solve(whole + floor, total).diagonal().mean())
-            p = min(1.0, len(shapes) * float(stats.chi2.sf(max(0.0, statistic), k)))
+            p = min(1.0, len(shapes) * float(stats.chi2.sf(statistic, k)))
             direction = (z @ step.float()) if float(step.abs().max()) > 0 else z.sum(1)
             direction = direction / direction.norm().clamp_min(1e-30)
             error = torch.linalg.inv(known).diagonal().sqrt()
-            best = Candidate(effect, max(0.0, statistic), p, retained, gain, step.float(), error.float(), shape, direction)
+            best = Candidate(effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction)
     effect.set_all(best.shape)
     return best
 

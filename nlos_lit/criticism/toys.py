@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import multiprocessing
+import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.criticism.criticise import CriticismSettings, look
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.split import Split
+from nlos_lit.criticism.steps import Report
 from nlos_lit.effects.scan import Scan
 from nlos_lit.surfel_fit import SurfelFit
 
@@ -59,19 +61,21 @@ def run_toys(
     split: Split,
     settings: CriticismSettings,
     store: Path,
-    tell: Callable[[int, int], None],
+    report: Report,
 ) -> Null:
     """``settings.toys`` toys in ``settings.processes`` processes.
 
     Each is kept in ``store`` as it is done, so that interrupted work goes on.
     """
+    began = time.monotonic()
     store.mkdir(parents=True, exist_ok=True)
     todo = [k for k in range(settings.toys) if not (store / f"toy_{k}.json").exists()]
     with ProcessPoolExecutor(settings.processes, mp_context=multiprocessing.get_context("spawn")) as pool:
         jobs = [pool.submit(_toy, toy_capture(capture, fit, k), pipeline, split, settings, k, store) for k in todo]
-        for done, job in enumerate(as_completed(jobs)):
+        for done, job in enumerate(as_completed(jobs), 1):
             job.result()
-            tell(settings.toys - len(todo) + done + 1, settings.toys)
+            passed = time.monotonic() - began
+            report(f"toy {settings.toys - len(todo) + done} of {settings.toys}", passed, passed / done * (len(todo) - done))
     return read_toys([store / f"toy_{k}.json" for k in range(settings.toys)])
 
 

@@ -84,10 +84,11 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
 
     threads = torch.get_num_threads()
     settings = CriticismSettings(toys=3, processes=1)
-    null = run_toys(scene, fit, pipeline, None, settings, tmp_path, lambda done, of: said.append((done, of)))
+    null = run_toys(scene, fit, pipeline, None, settings, tmp_path, lambda *report: said.append(report))
     torch.set_num_threads(threads)
     assert seeds == [(k, int(toy_capture(scene, fit, k).counts.sum())) for k in (0, 2)]
-    assert said == [(2, 3), (3, 3)]
+    assert [text for text, *_ in said] == ["toy 2 of 3", "toy 3 of 3"]
+    assert said[0][2] > said[1][2] == 0  # one to go, then none
     assert null == Null(3, {"irf_tail": pytest.approx((3 + 9 + 5) / 3)}, [1.5, 7.0, 2.5])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["toy_0.json", "toy_1.json", "toy_2.json"]
     again = run_toys(scene, fit, None, None, settings, tmp_path, None)

@@ -176,6 +176,18 @@ def test_amplitudes_stay_in_their_bounds():
     assert full.step.item() == pytest.approx(0.9 / 0.05)
 
 
+def test_bounds_do_not_hide_a_smooth_field(monkeypatch):
+    """Two columns that nearly cancel, pulled apart beyond their bounds: clipped, their balance is lost; held back, it is not."""
+    common, tiny = normal(ROWS, seed=11), normal(ROWS, seed=12)
+    five = torch.stack([common, common + 1e-3 * tiny, *normal(ROWS, 3, seed=13).unbind(1)], 1)
+    monkeypatch.setattr(screening, "weighted_columns", lambda *_, **__: five)
+    found = look("power_drift", 4 * common + 0.5 * tiny)
+    assert found.step.abs().max() < 30
+    worth = float((4 * Projector(problem(torch.zeros(ROWS))).off(common[:, None])).square().sum())
+    assert found.statistic == pytest.approx(worth, rel=0.05)
+    assert found.p_value < 1e-20
+
+
 def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
     monkeypatch.setattr(

@@ -1,0 +1,93 @@
+"""The steps of a diagnosis: said with the time that is left, and kept, so that an interrupted diagnosis goes on where it was."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+Report = Callable[[str, float, float], None]
+# What a step takes, in base fits, until one of its kind has been timed.
+SHARE = {"image": 0.3, "fit": 1.0, "screen": 1.0, "refit": 0.3, "check": 1.0}
+
+
+class Steps:
+    """Does the steps of one diagnosis.
+
+    Args:
+        report: called at the start of each step with what it is, seconds since the start, and seconds that are left (an estimate,
+            for the turn at hand).
+        folder: where results of steps are kept; None keeps nothing. The same settings and seed must have made what is there.
+    """
+
+    def __init__(self, report: Report = lambda text, passed, left: None, folder: Path | None = None) -> None:
+        self.report, self.folder = report, folder
+        self.shared: dict[str, Any] = {}
+        self.began, self.taken, self.ahead = time.monotonic(), {}, dict.fromkeys(SHARE, 0)
+
+    def share(self, objects: Mapping[str, Any]) -> None:
+        """Large objects that every result refers to; they are kept once, by whoever made them, not with each result."""
+        self.shared.update(objects)
+
+    def plan(self, **kinds: int) -> None:
+        """How many steps of each kind are to come."""
+        self.ahead = dict.fromkeys(SHARE, 0) | kinds
+
+    def left(self) -> float:
+        """Seconds of the steps that are planned."""
+        known = {kind: sum(taken) / len(taken) for kind, taken in self.taken.items()}
+        unit = max((known[kind] / SHARE[kind] for kind in known), default=0.0) if "fit" not in known else known["fit"]
+        return sum(number * known.get(kind, unit * SHARE[kind]) for kind, number in self.ahead.items())
+
+    def __call__(self, kind: str, text: str, name: str, make: Callable[[], T]) -> T:
+        """The result of ``make``, or of an earlier call that was kept under ``name``."""
+        file = None if self.folder is None else self.folder / f"{name}.pickle"
+        if file is not None and file.exists():
+            self.ahead[kind] = max(0, self.ahead[kind] - 1)
+            return self._load(file)
+        self.report(text, time.monotonic() - self.began, self.left())
+        began = time.monotonic()
+        result = make()
+        self.taken.setdefault(kind, []).append(time.monotonic() - began)
+        self.ahead[kind] = max(0, self.ahead[kind] - 1)
+        if file is not None:
+            self._keep(file, result)
+        return result
+
+    def _keep(self, file: Path, result: Any) -> None:
+        names = {id(value): name for name, value in self.shared.items()}
+        whole = io.BytesIO()
+        _Pickler(whole, names).dump(result)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(".part")
+        part.write_bytes(whole.getvalue())
+        part.rename(file)
+
+    def _load(self, file: Path) -> Any:
+        return _Unpickler(io.BytesIO(file.read_bytes()), self.shared).load()
+
+
+class _Pickler(pickle.Pickler):
+    """Writes names for shared objects."""
+
+    def __init__(self, file: io.BytesIO, names: Mapping[int, str]) -> None:
+        super().__init__(file, pickle.HIGHEST_PROTOCOL)
+        self.names = names
+
+    def persistent_id(self, obj: Any) -> str | None:
+        return self.names.get(id(obj))
+
+
+class _Unpickler(pickle.Unpickler):
+    """Puts shared objects in for their names."""
+
+    def __init__(self, file: io.BytesIO, shared: Mapping[str, Any]) -> None:
+        super().__init__(file)
+        self.shared = shared
+
+    def persistent_load(self, pid: str) -> Any:
+        return self.shared[pid]
