@@ -56,6 +56,7 @@ class Workload:
         depth, planes, plane_pitch: nearest voxel plane, their number and spacing.
         lateral: voxels along x and y; None takes one a spot.
         gate: first bin that is fitted.
+        wavelength: m; None takes four spot spacings.
         batch, rays: spots an iteration, and the side of each one's square of rays.
         paper_hours: time the paper reports on an A100, None where it has no such configuration.
     """
@@ -72,6 +73,7 @@ class Workload:
     lateral: tuple[int, int] | None = None
     gate: int = 0
     threshold: float = 0.2
+    wavelength: float | None = None
     iterations: int = 100
     batch: int = 32
     rays: int = 200
@@ -191,7 +193,9 @@ class Training:
         last = workload.depth + (workload.planes - 1) * workload.plane_pitch
         grid = volume_grid(capture, depth=(workload.depth, last + 1e-9), depth_pitch=workload.plane_pitch, lateral=workload.lateral)
         self.pipeline: Pipeline = build_pipeline(
-            capture, grid, PipelineSettings(threshold=workload.threshold, rays=workload.rays, **settings)
+            capture,
+            grid,
+            PipelineSettings(threshold=workload.threshold, rays=workload.rays, wavelength=workload.wavelength, **settings),
         ).to(self.device)
         self.plan: PhasorPlan = self.pipeline.phasor.plan(capture, budget)
         self.criterion = Objective(normalisation(capture), sparsity, LAMBDA_ALBEDO, 64, seed)

@@ -31,7 +31,7 @@ class Objective(NamedTuple):
         """Loss terms and their sum over a batch: ``spots`` ``[S]``, gated ``counts`` ``[S, T]``, number of the iteration."""
         rendering = pipeline(spots)
         terms = {"transient": transient_loss(counts / self.scale, rendering.expected / self.scale)}
-        terms |= self.regularisation(rendering.intensity, self._voxel_batch(rendering.albedo, step))
+        terms |= self.regularisation(rendering.intensity, self.voxel_batch(rendering.albedo, step))
         terms["loss"] = terms["transient"] + terms["sparsity"] + terms["albedo"]
         return terms
 
@@ -42,7 +42,8 @@ class Objective(NamedTuple):
             "albedo": self.lambda_albedo * albedo_variation(albedo),
         }
 
-    def _voxel_batch(self, albedo: Tensor, step: int) -> Tensor:
+    def voxel_batch(self, albedo: Tensor, step: int) -> Tensor:
+        """The planes of E_ρ in this iteration."""
         planes = albedo.shape[0]
         if self.albedo_planes is None or self.albedo_planes >= planes:
             return albedo
