@@ -16,6 +16,8 @@ from torch import Tensor
 
 from nlos_lit.functional.concentric import LIPSCHITZ, hemisphere_to_square
 
+_ROWS = 1 << 17  # samples worked on at once on a CPU
+
 
 class Lattice(NamedTuple):
     """Voxel centres at ``origin + pitch·index``; volumes are ``[nz, nx, ny]``, vectors (x, y, z), metres."""
@@ -58,8 +60,37 @@ def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
 
 def trilinear(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
     """``[M]`` values of ``volume`` ``[nz, nx, ny]`` at ``points`` ``[M, 3]`` m; differentiable in both."""
-    index, weight = corner_weights(points, lattice)
-    return (volume.reshape(-1)[index] * weight).sum(1)
+    return _Trilinear.apply(volume, points, lattice)
+
+
+class _Trilinear(torch.autograd.Function):
+    """Keeps the points alone: corners and weights are worked out again, and only where a gradient arrives."""
+
+    @staticmethod
+    def forward(ctx, volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
+        ctx.lattice = lattice
+        ctx.save_for_backward(volume, points)
+        return sample(volume, points, lattice)
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+        volume, points = ctx.saved_tensors
+        flat = volume.detach().reshape(-1)
+        to_volume = torch.zeros_like(flat) if ctx.needs_input_grad[0] else None
+        to_points = torch.zeros_like(points) if ctx.needs_input_grad[1] else None
+        on_host = grad.device.type == "cpu"
+        parts = torch.nonzero(grad).squeeze(1).split(_ROWS) if on_host else (slice(None),)
+        for part in parts:
+            pull = grad[part][:, None]
+            with torch.enable_grad():
+                where = points[part].detach().requires_grad_(to_points is not None)
+                index, weight = corner_weights(where, ctx.lattice)
+                if to_points is not None:
+                    value = (flat[index] * weight).sum(1, keepdim=True)
+                    to_points[part] = torch.autograd.grad(value, where, pull)[0]
+            if to_volume is not None:
+                to_volume.index_add_(0, index.reshape(-1), (pull * weight.detach()).reshape(-1))
+        return None if to_volume is None else to_volume.view_as(volume), to_points, None
 
 
 @torch.no_grad()
@@ -129,7 +160,7 @@ def march(
     step: float,
     reach: float,
     fine: int = 1,
-    chunk: int = 1 << 17,
+    chunk: int = _ROWS,
 ) -> Samples:
     """Find, on every ray that meets the threshold, the samples that decide where its surface lies.
 
@@ -184,7 +215,9 @@ def march(
             above = torch.nonzero(value >= threshold).squeeze(1)
             value, on = value[above], line[part].index_select(0, owner[above])
             peak.scatter_reduce_(0, on, value, "amax")
-            kept.append((on, distance[above], value))
+            # The peak can only rise: what is too low now stays too low.
+            near_peak = torch.nonzero(value >= peak[on] - (reach if fine == 1 else 0.0)).squeeze(1)
+            kept.append((on[near_peak], distance[above[near_peak]], value[near_peak]))
     if not kept:
         empty = torch.zeros(0, dtype=torch.long, device=device)
         return Samples(empty, empty, empty, torch.zeros(0, device=device))
