@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import torch
 
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
-from nlos_lit.criticism.refit import compare, copy_effects, log_likelihood, refit_with, score
+from nlos_lit.criticism.joint_step import copy_effects
+from nlos_lit.criticism.refit import compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.rivals import Trial, best_of_each, choose, group_of
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
 from nlos_lit.criticism.sensitivity import Problem, build_problem
@@ -26,7 +27,7 @@ from nlos_lit.surfel_fit import SurfelFit
 log = logging.getLogger(__name__)
 WORK = 1e12  # multiplications of the nuisance columns with each other, some 40 s of one core
 WELL = 0.01  # retained information from which on an effect counts as well identifiable
-Rebuild = Callable[[Extension], SurfelFit]
+Rebuild = Callable[[Extension, int], SurfelFit]
 
 
 @dataclass(frozen=True)
@@ -69,13 +70,14 @@ class CriticismSettings:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: the screening, the rivals, and who was accepted (None ends it)."""
+    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without another effect."""
 
     candidates: list[Candidate]
     discrepancies: list[Discrepancy]
     trials: list[Trial]
     accepted: Trial | None
     group: list[str]
+    controls: list[SurfelFit | None] = field(default_factory=list)
 
 
 def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
@@ -96,25 +98,35 @@ def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[
     return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
 
 
-def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int) -> tuple[list[Candidate], list[Discrepancy]]:
+@dataclass(frozen=True)
+class Look:
+    """Effects and flexible discrepancies as the score tests see them; ``own`` ``[P]``: the step that the base alone would take."""
+
+    candidates: list[Candidate]
+    discrepancies: list[Discrepancy]
+    own: torch.Tensor
+
+
+def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int) -> Look:
     """Screen all effects that the fit does not have yet, and the flexible discrepancies."""
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
     candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
-    return candidates, discrepancies(problem, projector, scan)
+    return Look(candidates, discrepancies(problem, projector, scan), projector.weights(problem.residual[:, None])[:, 0])
 
 
 def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
+    The control goes through the same without another effect (as it is, refitted, or rebuilt with another random seed).
+
     Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
     """
     number = len(fit.extension.effects) + 1
     steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
-    candidates, rest = steps(
-        "screen", f"screening effects, turn {number}", f"turn{number}_screen", lambda: look(fit, split, scan, s, seed)
-    )
+    seen = steps("screen", f"screening effects, turn {number}", f"turn{number}_screen", lambda: look(fit, split, scan, s, seed))
+    candidates, rest = seen.candidates, seen.discrepancies
     (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
     wanted = significant(candidates, s, over)
@@ -123,10 +135,12 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
     rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
-    steps.plan(refit=1 + len(rivals), fit=min(s.finalists, len(rivals)))
-    reference = steps(
-        "refit", "refitting the control", f"turn{number}_control", lambda: control_likelihood(fit, split, s.steps, seed)
-    )
+    steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
+    own = partial(refit_with, fit, [], s.steps, seed, seen.own)
+    controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
+    anew = partial(_rebuilt, rebuild, fit.extension, seed + 1)
+    controls.append(steps("fit", "rebuilding the control", f"turn{number}_rebuild", anew))
+    reference = best_likelihood(controls, split)
 
     def trial(candidate: Candidate, again: SurfelFit) -> Trial:
         likelihood = log_likelihood(again, split.select)
@@ -149,32 +163,32 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     for candidate, extension in finalists:
         name = candidate.effect.name
         again = steps(
-            "fit", f"rebuilding the scene with {name}", f"turn{number}_rebuild_{name}", partial(_rebuilt, rebuild, extension)
+            "fit", f"rebuilding the scene with {name}", f"turn{number}_rebuild_{name}", partial(_rebuilt, rebuild, extension, seed)
         )
         if again is not None:
             trials.append(trial(candidate, again))
     trials = best_of_each(trials)
     if not trials:
-        return Turn(candidates, rest, [], None, [])
+        return Turn(candidates, rest, [], None, [], controls)
     best = choose(trials, block)
     if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested / 2:
-        return Turn(candidates, rest, trials, None, [])
-    return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar))
+        return Turn(candidates, rest, trials, None, [], controls)
+    return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar), controls)
 
 
-def _rebuilt(rebuild: Rebuild, extension: Extension) -> SurfelFit | None:
+def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int) -> SurfelFit | None:
     """None: with these effects no surfel survives, so that they are not the ones."""
     try:
-        return rebuild(copy_effects(extension, []))
+        return rebuild(copy_effects(extension, []), seed)
     except UserError as error:
         log.info("a rebuild leaves nothing: %s", error)
         return None
 
 
-def control_likelihood(fit: SurfelFit, split: Split, steps: int, seed: int) -> torch.Tensor:
-    """``[S]`` log-likelihoods of the select spots without another effect: of the fit as it is or refitted, whichever is better."""
-    both = [log_likelihood(f, split.select) for f in (fit, refit_with(fit, [], steps, seed))]
-    return max(both, key=lambda values: float(values.sum()))
+def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
+    """``[S]`` log-likelihoods of the select spots of the best of several fits; None are skipped."""
+    found = [log_likelihood(f, split.select) for f in fits if f is not None]
+    return max(found, key=lambda values: float(values.sum()))
 
 
 def null_of(effect: Effect) -> Effect:
@@ -239,8 +253,8 @@ def criticise(
 
     Args:
         base: fitted to ``split.fit`` without effects.
-        rebuild: a fit from new seeds with the given effects, begun at their present values: surfels that imitated an effect do not
-            come back.
+        rebuild: a fit from new seeds with the given effects, begun at their present values, and the given random seed: surfels that
+            imitated an effect do not come back.
         steps: says and keeps what is done.
     """
     fit, turns, steps = base, [], steps or Steps()
@@ -252,7 +266,7 @@ def criticise(
         fit = best.fit
         if len(fit.extension.effects) == s.most:
             last = steps("screen", "screening what is left", "last_screen", partial(look, fit, split, scan, s, seed))
-            turns.append(Turn(*last, [], None, []))
+            turns.append(Turn(last.candidates, last.discrepancies, [], None, []))
             break
     fit = drop_needless(fit, split, s, seed, steps)
     return Findings(base, fit, turns)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.criticism.joint_step import best_start
 from nlos_lit.criticism.per_spot import factors, solve, sparse, spot_scores
 from nlos_lit.criticism.result import Scores
 from nlos_lit.criticism.screen import Candidate
-from nlos_lit.criticism.sensitivity import acting_order
-from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.refine import score_spots
 from nlos_lit.surfel_fit import SurfelFit
 
@@ -29,37 +27,19 @@ class Comparison:
     interval: tuple[float, float]
 
 
-def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
-    """A copy of the extension with more effects at their present values, in order of application."""
-    return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
-
-
-def set_step(effect: Effect, step: Tensor) -> None:
-    """Move an effect's stored amplitudes by ``step`` ``[k]`` (all amplitudes in order), within bounds."""
-    with torch.no_grad():
-        start = 0
-        for p in effect.amplitudes:
-            getattr(effect, f"raw_{p.name}").add_(step[start : start + p.size])
-            start += p.size
-    effect.clamp()
-
-
-def refit_with(fit: SurfelFit, candidates: list[Candidate], steps: int, seed: int, rounds: int = 1) -> SurfelFit:
+def refit_with(fit: SurfelFit, candidates: list[Candidate], steps: int, seed: int, beside: Tensor | None = None) -> SurfelFit:
     """Warm-started joint refit with more effects (none: the control), begun at their one-step estimates.
 
-    ``rounds`` above 1 let surfels die and grow first.
+    ``beside`` ``[P]``: what the base does at the same time; None takes that of a single candidate, and nothing for several.
     """
-    extra = []
-    for candidate in candidates:
-        effect = copy.deepcopy(candidate.effect)
-        set_step(effect, candidate.step)
-        extra.append(effect)
-    again = fit.copy(copy_effects(fit.extension, extra), seed)
+    if beside is None and len(candidates) == 1:
+        beside = candidates[0].beside
+    again = best_start(fit, [c.effect for c in candidates], [c.step for c in candidates], beside, seed)
     random = [e for e in again.extension.effects if e.per_spot]
     for effect in random:  # solved spot by spot: random batches would visit each number a few times only
         effect.requires_grad_(False)
         solve(again.model, again.extension, effect, again.train, again.counts)
-    again.run(rounds, steps=steps, settle=False, grow_first=rounds > 1)
+    again.run(1, steps=steps, settle=False)
     for effect in random:
         solve(again.model, again.extension, effect, again.train, again.counts)
     return again

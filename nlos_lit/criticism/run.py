@@ -58,8 +58,8 @@ def diagnose(
     base = steps("fit", "fitting the base", "base", lambda: pipeline.fit(capture, split, image, Extension([]), seed))
     steps.share({"counts": base.counts, "grid": base.grid, "reserve": base.reserve})
 
-    def rebuild(extension: Extension) -> SurfelFit:
-        again = pipeline.fit(capture, split, image, extension, seed)
+    def rebuild(extension: Extension, with_seed: int) -> SurfelFit:
+        again = pipeline.fit(capture, split, image, extension, with_seed)
         again.counts = base.counts
         return again
 

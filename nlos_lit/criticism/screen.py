@@ -13,7 +13,7 @@ weighs effects with one and with thirty coefficients on the same scale, and misf
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from scipy import stats
@@ -33,7 +33,8 @@ class Candidate:
     """One effect (at its best shape) as the score test sees it.
 
     ``gain`` nats, cross-validated; ``step`` ``[k]`` one-step change of the stored amplitudes; ``direction`` ``[N]`` unit vector:
-    what the step changes, projected off the nuisance, for comparison with rivals.
+    what the step changes, projected off the nuisance, for comparison with rivals. ``beside`` ``[P]``: what the base does at the
+    same time, coefficients of the nuisance columns; None where that is not known.
     """
 
     effect: Effect
@@ -45,6 +46,7 @@ class Candidate:
     error: Tensor
     shape: dict[str, float]
     direction: Tensor = field(repr=False)
+    beside: Tensor | None = field(default=None, repr=False)
 
     @property
     def degrees(self) -> int:
@@ -68,8 +70,11 @@ class Projector:
 
     def off(self, columns: Tensor) -> Tensor:
         """``columns`` ``[N, k]`` without their projection on the nuisance."""
-        weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor)
-        return columns - self.nuisance @ weights.float()
+        return columns - self.nuisance @ self.weights(columns)
+
+    def weights(self, columns: Tensor) -> Tensor:
+        """``[P, k]`` coefficients of the nuisance that come closest to ``columns``."""
+        return torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
 
 
 def screen(problem: Problem, projector: Projector, effects: list[Effect], folds: Tensor) -> list[Candidate]:
@@ -114,9 +119,11 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
             direction = (z @ step.float()) if float(step.abs().max()) > 0 else z.sum(1)
             direction = direction / direction.norm().clamp_min(1e-30)
             error = torch.linalg.inv(known).diagonal().sqrt()
-            best = Candidate(effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction)
+            best = Candidate(
+                effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction, raw @ step.float()
+            )
     effect.set_all(best.shape)
-    return best
+    return replace(best, beside=projector.weights((problem.residual - best.beside)[:, None])[:, 0])
 
 
 def _predicted(score: Tensor, information: Tensor, ridge: Tensor, lower: Tensor, upper: Tensor) -> float:
@@ -167,4 +174,5 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     direction = (column * full[problem.spots, None]).reshape(-1)
     direction = direction / direction.norm().clamp_min(1e-30)
     p = float(stats.chi2.sf(2 * gain, 1 + positive))
-    return Candidate(effect, 2 * gain, p, 1.0, gain, full, error, {}, direction)
+    beside = projector.weights((problem.residual - (column * full[problem.spots, None]).reshape(-1))[:, None])[:, 0]
+    return Candidate(effect, 2 * gain, p, 1.0, gain, full, error, {}, direction, beside)

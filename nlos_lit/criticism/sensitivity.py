@@ -62,7 +62,7 @@ def build_problem(model: SurfelModel, extension: Extension, spots: Tensor, count
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m = len(model)
-    tilts = _tilt_fields(model)
+    tilts = tilt_fields(model)
     size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
@@ -192,7 +192,7 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor) -> Tensor:
     """``[B, T, 2M + 2F]`` derivatives of the transients by albedos (in units of themselves), depths (in bins) and tilts."""
     centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
-    unit = torch.maximum(albedo, 0.05 * albedo.mean())
+    unit = albedo_unit(albedo)
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)
     seen = model.visible[spots][:, :, None] if len(model.visible) else 1.0
@@ -205,8 +205,7 @@ def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, 
         energy = extension.path(paths.contribution * rho[:, None], paths, spots)
         return energy, model.arrival(extension.time(paths.length, paths, spots))
 
-    across = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal, dim=1)
-    along = torch.linalg.cross(normal, across)
+    across, along = tilt_frame(normal)
     zero, one = torch.zeros_like(albedo), torch.ones_like(albedo)
     start = (albedo, zero, zero, zero)
     blocks = []
@@ -234,13 +233,24 @@ def _scatter_surfels(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
     return flat.view(b, n_bins + 2 * pad, m)[:, pad:-pad]
 
 
-def _tilt_fields(model: SurfelModel) -> Tensor:
+def tilt_fields(model: SurfelModel) -> Tensor:
     """``[M, F]`` smooth functions over the hidden scene (mean square 1 each), the constant first."""
     xy = model.centre().detach()[:, :2]
     low, high = xy.amin(0), xy.amax(0)
     place = 2 * (xy - low) / (high - low).clamp_min(1e-6) - 1
     fields = smooth_map_basis(place, 5)[0] if len(xy) > 50 else place[:, :0]
     return torch.cat([torch.ones(len(xy), 1), fields], 1)
+
+
+def tilt_frame(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two directions ``[M, 3]`` in which each normal may lean, the first as nearly along x as it can be."""
+    across = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal, dim=1)
+    return across, torch.linalg.cross(normal, across)
+
+
+def albedo_unit(albedo: Tensor) -> Tensor:
+    """``[M]`` that albedo columns count in: the albedo itself, for weak surfels a twentieth of the mean."""
+    return torch.maximum(albedo, 0.05 * albedo.mean())
 
 
 def _path_batch(model: SurfelModel) -> int:

@@ -90,7 +90,7 @@ def read_toys(files: list[Path]) -> Null:
 def _toy(capture: Capture, pipeline: Pipeline, split: Split, settings: CriticismSettings, seed: int, store: Path) -> None:
     torch.set_num_threads(1)
     fit = pipeline(capture, split, seed)
-    candidates, _ = look(fit, split, Scan.of(capture), settings, seed)
+    candidates = look(fit, split, Scan.of(capture), settings, seed).candidates
     result = {
         "statistic": {c.effect.name: c.statistic for c in candidates},
         "degrees": {c.effect.name: c.degrees for c in candidates},

@@ -18,8 +18,9 @@ from data_modules.readers import read_capture
 from nlos_lit.build import PipelineSettings
 from nlos_lit.capture import Capture
 from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings, Findings, control_likelihood
-from nlos_lit.criticism.refit import copy_effects, log_likelihood, refit_with
+from nlos_lit.criticism.criticise import CriticismSettings, Findings, best_likelihood
+from nlos_lit.criticism.joint_step import copy_effects
+from nlos_lit.criticism.refit import log_likelihood, refit_with
 from nlos_lit.criticism.result import Diagnosis
 from nlos_lit.criticism.run import diagnose
 from nlos_lit.criticism.split import split_spots
@@ -95,7 +96,8 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
     split = split_spots(capture)
     gain = best = 0.0
     if diagnosis.effects or (oracle and truth.names):
-        before = control_likelihood(found.base, split, options.steps, 0)
+        controls = found.turns[0].controls or [found.base, refit_with(found.base, [], options.steps, 0)]
+        before = best_likelihood(controls, split)
         gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
         best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else 0.0
     return Outcome(

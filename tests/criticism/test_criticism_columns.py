@@ -10,8 +10,8 @@ import torch
 from criticism_scenes import FORWARD_MODE, capture_of, double_precision, effect_of, hide_some, scattered, surfels, uneven
 from torch import Tensor
 
-from nlos_lit.criticism.refit import copy_effects
-from nlos_lit.criticism.sensitivity import TILT_PRIOR, _tilt_fields, acting_order, build_problem, effect_columns, weighted_columns
+from nlos_lit.criticism.joint_step import copy_effects
+from nlos_lit.criticism.sensitivity import TILT_PRIOR, acting_order, build_problem, effect_columns, tilt_fields, weighted_columns
 from nlos_lit.effects import EFFECTS, Extension, Scan
 from nlos_lit.surfels import SurfelModel, inverse_softplus
 
@@ -102,7 +102,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
 def test_smooth_tilts_lean_many_surfels_together():
     """More than fifty surfels lean by smooth functions of their place, orthonormal, each with the prior of a tenth of a radian."""
     model, extension, _, spots = setting("confocal", number=56)
-    fields = _tilt_fields(model)
+    fields = tilt_fields(model)
     f, m = fields.shape[1], len(model)
     assert f > 10
     assert torch.allclose(fields.T @ fields / m, torch.eye(f), atol=1e-6)

@@ -17,7 +17,7 @@ from scipy import stats
 from nlos_lit.build import PipelineSettings
 from nlos_lit.criticism import toys
 from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings
+from nlos_lit.criticism.criticise import CriticismSettings, Look
 from nlos_lit.criticism.numerics import numerics
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import SIDE, profiles
@@ -74,7 +74,7 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
     """Toy 1 is there already: it is read as it is, and only 0 and 2 are run, with their own seeds."""
     (tmp_path / "toy_1.json").write_text(json.dumps({"statistic": {"irf_tail": 9.0}, "degrees": {"irf_tail": 1}, "largest": 7.0}))
     monkeypatch.setattr(toys, "ProcessPoolExecutor", lambda processes, mp_context: ThreadPoolExecutor(processes))
-    monkeypatch.setattr(toys, "look", lambda fit, split, scan, settings, seed: ([candidate("irf_tail", 3.0 + seed)], []))
+    monkeypatch.setattr(toys, "look", lambda fit, split, scan, settings, seed: Look([candidate("irf_tail", 3.0 + seed)], [], None))
     scene = capture_of(raster(8))
     fit, seeds, said = fit_of(surfels(scene), scene), [], []
 

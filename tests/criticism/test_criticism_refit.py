@@ -18,6 +18,7 @@ from nlos_lit.criticism import criticise as loop
 from nlos_lit.criticism.criticise import (
     CriticismSettings,
     Findings,
+    Look,
     Trial,
     Turn,
     best_of_each,
@@ -29,7 +30,8 @@ from nlos_lit.criticism.criticise import (
     null_of,
     significant,
 )
-from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with, score, set_step
+from nlos_lit.criticism.joint_step import set_step
+from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.steps import Steps
 from nlos_lit.effects import Extension, Scan
@@ -254,7 +256,7 @@ def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
         return Turn([], [], [accepted], accepted, [])
 
     monkeypatch.setattr(loop, "turn", turn)
-    monkeypatch.setattr(loop, "look", lambda *_: ([], rest))
+    monkeypatch.setattr(loop, "look", lambda *_: Look([], rest, None))
 
     def drop(fit: FakeFit, *_: object) -> FakeFit:
         return FakeFit(tuple(n for n in accepting if n in fit.names and n != "pile_up"))
