@@ -79,12 +79,10 @@ def table1(work: Workspace, size: Size) -> Evidence:
         "table1",
         "Table 1: what each component gives",
         "Two-albedo Bunny, 256×256 spots, renders of Chen et al.; MSE of transients of six combinations. From the kernel alone "
-        "to the "
-        f"full model the MSE falls by {old_worst / old_best:.3g} ×.",
+        f"to the full model the MSE falls by {old_worst / old_best:.3g} ×.",
         f"{subject.label}, albedos 1.0 above and 0.3 below; held-out spots; mean of {len(size.seeds)} seeds (start of batches), "
-        "spread = "
-        f"largest minus smallest. From the kernel alone to the full model the MSE falls by {worst / best:.3g} ×, to the surfels by "
-        f"{worst / np.mean(surfels):.3g} ×. MSEs of the two columns are of different captures: compare ratios.",
+        f"spread = largest minus smallest. From the kernel alone to the full model the MSE falls by {worst / best:.3g} ×, to the "
+        f"surfels by {worst / np.mean(surfels):.3g} ×. MSEs of the two columns are of different captures: compare ratios.",
         rows,
         {"mse": shown},
         {"mse": "MSE of held-out transients for each combination of optimised components; one mark a seed."},
@@ -157,8 +155,7 @@ def figure8(work: Workspace, size: Size) -> Evidence:
         "Figure 8: albedo apart from geometry",
         "Two-albedo Bunny (1.0 and 0.3): the optimised albedo shows both halves, the geometry none of it. No numbers.",
         f"{subject.label}. Mean albedo of points near the truth in the upper over that in the lower half; depth and normals on "
-        "each half apart. "
-        "If geometry followed albedo, the two halves would differ in depth bias.",
+        "each half apart. If geometry followed albedo, the two halves would differ in depth bias.",
         rows,
         {"albedo": shown},
         {"albedo": "Albedo (scaled to its 98th percentile) and depth from the wall: truth, published system, ours, ours refined."},

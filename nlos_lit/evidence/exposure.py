@@ -68,15 +68,12 @@ def figure7(work: Workspace, size: Size) -> Evidence:
         "figure7",
         "Figure 7 and supplement Figure 1: exposure",
         "Resolution and Bike, 10, 30, 60 and 180 min: LCT, f-k and phasor fields lose detail or drown in noise, the calibrated "
-        "result stays clear, "
-        "also against LCT with its SNR parameter set by hand between 0.001 and 1. Pictures only.",
+        "result stays clear, also against LCT with its SNR parameter set by hand between 0.001 and 1. Pictures only.",
         f"{exposed(work, size, size.minutes[-1]).label}: the whole file is called {size.minutes[-1]} min and thinned binomially "
-        "to the paper's "
-        "ratios; only the ratios mean something. There is no true surface, so letters and background are where the mean of "
-        "LCT, f-k, phasor field "
-        f"and ours at full exposure is above {ON}, and its darkest half. Separation: probability that a letter's pixel is "
-        "brighter than one of the "
-        "background (0.5: nothing, 1: perfect; no threshold or brightness scale enters). Contrast: in amplitudes.",
+        "to the paper's ratios; only the ratios mean something. There is no true surface, so letters and background are where "
+        f"the mean of LCT, f-k, phasor field and ours at full exposure is above {ON}, and its darkest half. Separation: "
+        "probability that a letter's pixel is brighter than one of the background (0.5: nothing, 1: perfect; no threshold or "
+        "brightness scale enters). Contrast: in amplitudes.",
         rows,
         {
             "volumes": plots.images(grid, labels, [n.replace("ours, ", "ours,\n") for n in names], ends),
@@ -86,7 +83,7 @@ def figure7(work: Workspace, size: Size) -> Evidence:
         {
             "volumes": "Maximum of the volume along z at each exposure (refined: albedo of the surfels), each scaled to "
             "its own 99.5th percentile.",
-            "sweep": "The light-cone transform with its signal-to-noise parameter from 0.001 to 1.",
+            "sweep": f"The light-cone transform with its signal-to-noise parameter from {size.snrs[0]:g} to {size.snrs[-1]:g}.",
             "separation": "How well letters and background separate against exposure.",
         },
         [_glance(rows, minutes) for minutes in size.minutes],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from nlos_lit.baselines import reconstruct_directed
 from nlos_lit.baselines.surface import front_points
 from nlos_lit.evidence.record import CLASSICAL, Row
 from nlos_lit.evidence.workspace import Scene
-from nlos_lit.export import Points, read_points
+from nlos_lit.export import Points, read_points, read_volume
 from nlos_lit.geometry_metrics import GeometryErrors, geometry_errors
 from nlos_lit.mesh import poisson_mesh
 
@@ -68,6 +69,21 @@ def run_points(folder: Path, refined: bool) -> Points:
         return read_points(folder / "points.ply")
     points = read_points(folder / "refined" / "points.ply")
     return selected(points, points.albedo >= FAINTEST)
+
+
+def front_of_run(folder: Path, scene: Scene) -> Points:
+    """The maximum along z of a training's volume, as of the classical methods, at the scene's own threshold."""
+    volume, grid, _ = read_volume(folder / "volume.h5")
+    return front_points(volume, grid, scene.threshold)
+
+
+# system → which training, and what of it
+OURS: dict[str, tuple[str, Callable[[Path, Scene], Points]]] = {
+    "published system": ("paper", lambda folder, _: run_points(folder, refined=False)),
+    "ours, phasor surface": ("ours", lambda folder, _: run_points(folder, refined=False)),
+    "ours, volume's front": ("ours", front_of_run),
+    "ours, refined": ("ours", lambda folder, _: run_points(folder, refined=True)),
+}
 
 
 def selected(points: Points, keep: np.ndarray) -> Points:

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from nlos_lit.evidence import plots
-from nlos_lit.evidence.geometry import OURS
-from nlos_lit.evidence.methods import classical_points, errors_of, geometry_row, run_points
+from nlos_lit.evidence.methods import OURS, classical_points, errors_of, geometry_row
 from nlos_lit.evidence.record import CLASSICAL, Evidence, Glance, Row
 from nlos_lit.evidence.subjects import BACKGROUND, Size, noisy_bunny
 from nlos_lit.evidence.workspace import Arrays, Scene, Subject, Workspace
@@ -57,17 +56,15 @@ def figure6(work: Workspace, size: Size) -> Evidence:
         for what, logy in SHOWN.items()
     ]  # fmt: skip
     ends = [scene.extent] * len(levels)
-    columns = [*METHODS, "published", "ours, phasor", "ours, refined"]
+    columns = [*METHODS, "published", "ours, phasor", "ours, front", "ours, refined"]
     lowest, highest = size.counts[0], size.counts[-1]
     return Evidence(
         "figure6",
         "Figure 6: Poisson noise",
         "Bunny with Poisson noise of rising strength: the surface stays recognisable over a wide range. Pictures only.",
         f"{noisy_bunny(work, size, highest).label.rsplit(',', 1)[0]}, signal and background scaled together. Points against the "
-        "first true "
-        "surface along z (2 cm in depth, one spot spacing sideways). Threshold and signal-to-noise parameter of the classical "
-        "systems are chosen "
-        "with the truth in hand at every level; the published system and ours keep one setting.",
+        "first true surface along z (2 cm in depth, one spot spacing sideways). Threshold and signal-to-noise parameter of the "
+        "classical systems are chosen with the truth in hand at every level; the published system and ours keep one setting.",
         rows,
         {"ladder": plots.lines(panels), "depth": plots.images(maps, levels, columns, ends, side=1.45)},
         {
@@ -99,8 +96,8 @@ def _level(work: Workspace, size: Size, subject: Subject, scene: Scene) -> dict[
     for name in METHODS:
         compute = lambda name=name: entry(*classical_points(scene, name, size.snrs))  # noqa: E731
         found[name] = work.kept(f"figure6/{subject.name}_{name}", compute)
-    for name, (run, refined) in OURS.items():
-        found[name] = entry(run_points(runs[run], refined), {})
+    for name, (run, take) in OURS.items():
+        found[name] = entry(take(runs[run], scene), {})
     return found
 
 

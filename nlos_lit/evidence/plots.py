@@ -13,6 +13,7 @@ from nlos_lit.figures import BLACK, BLUE, DEPTH, GREEN, INTENSITY, NOTHING, ORAN
 COLOURS = {
     "ours, refined": RED,
     "ours, phasor surface": ORANGE,
+    "ours, volume's front": "#F0E442",
     "published system": BLACK,
     "lct": BLUE,
     "dlct": SKY,

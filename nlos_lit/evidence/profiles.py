@@ -46,11 +46,9 @@ def profiles(work: Workspace, size: Size) -> Evidence:
         "Profiles: the paper's formulation, the authors' code, and what was changed",
         f"Not in the paper. The authors' code itself reaches a transient error of {CODE_NMSE_SU} on SU (8 spots × 6400 rays, 72 "
         "iterations).",
-        "model=paper, model=reference_code and the default at the same rays and iterations (docs/model.md says what they "
-        "differ in); surfels "
-        "refined from the default's image; the same with effects fitted along. Deviance over noise: Poisson deviance of "
-        "held-out bins over what "
-        "counting noise alone gives (1 is perfect). Geometry where the truth is known.",
+        "model=paper, model=reference_code and the default at the same rays and iterations (docs/model.md says what they differ "
+        "in); surfels refined from the default's image; the same with effects fitted along. Deviance over noise: Poisson "
+        "deviance of held-out bins over what counting noise alone gives (1 is perfect). Geometry where the truth is known.",
         rows,
         {"depth": plots.images(maps, labels, names, ends, side=2.2)},
         {"depth": "Depth (m) of the surface as seen from the wall, by profile."},

@@ -48,9 +48,8 @@ def figure9(work: Workspace, size: Size) -> Evidence:
         "figure9",
         "Figure 9: real scenes",
         "SU (confocal), 44i and NLOS (one detector): albedo, points and normals. Pictures only.",
-        "Real captures; one training each with the default settings of its scene, 100 iterations; then refined. 44i and NLOS "
-        "are not at hand: "
-        "the 4 of the same laboratory and kind of scan stands for them.",
+        "Real captures; one training each with the default settings of its scene, 100 iterations; then refined. 44i and NLOS are "
+        "not at hand: the 4 of the same laboratory and kind of scan stands for them.",
         rows,
         {"scenes": plots.images(grid, labels, columns, ends, side=1.9)},
         {

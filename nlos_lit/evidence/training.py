@@ -102,8 +102,8 @@ def figure5(work: Workspace, size: Size) -> Evidence:
     return Evidence(
         "figure5",
         "Figure 5: convergence of the system parameters",
-        "Bike (real): Ω_pf, σ_pf, σ_ls, I_l, κ_s, η_s settle; the rendered transient comes to resemble the measured one. "
-        "Curves only.",
+        "Bike (real): Ω_pf, σ_pf, σ_ls, I_l, κ_s, η_s settle; the rendered transient comes to resemble the measured one. Curves "
+        "only.",
         f"{known.label}, whose response is known, and {real.label}. 'refined' is what the surfels find from there.",
         rows, shown, captions, [_response_glance(rows, known)],
     )  # fmt: skip
