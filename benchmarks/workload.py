@@ -152,8 +152,8 @@ def synthetic_capture(workload: Workload, counts_per_spot: float = 3000.0, seed:
     to_points = lambda a: torch.cdist(torch.from_numpy(a).float(), points, compute_mode="donot_use_mm_for_euclid_dist")  # noqa: E731
     generator = torch.Generator().manual_seed(seed)
     counts = np.empty((len(wall), workload.bins), dtype=np.uint16)
-    for begin in range(0, len(wall), 4096):
-        rows = slice(begin, begin + 4096)
+    for begin in range(0, len(wall), 512):
+        rows = slice(begin, begin + 512)
         d_l, d_s = to_points(wall[rows]), to_points(sensor[rows])
         bins = ((d_l + d_s) / workload.bin_length).long()
         inside = bins < workload.bins

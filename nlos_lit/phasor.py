@@ -32,11 +32,13 @@ class PhasorPlan:
     rank: int
     precision: torch.dtype
     field_bytes: int
-    working_bytes: int
+    reading_bytes: int  # transients and their spectra, before there is a field
+    working_bytes: int  # beside the field while it is propagated
 
     @property
     def total_bytes(self) -> int:
-        return self.field_bytes + self.working_bytes
+        """Largest while the field is made."""
+        return max(self.reading_bytes, self.field_bytes + self.working_bytes)
 
     def __str__(self) -> str:
         kind = str(self.precision).removeprefix("torch.")
@@ -115,14 +117,15 @@ class PhasorImaging(nn.Module):
         else:
             spectra = 8 * n_freq * layout.padded_points * len(layout.geometry.rows)
             propagating = spectra + max(16 * n_freq * capture.n_spots * layout.refine**2, layout.plane_bytes(n_freq, rank))
-        # Whole transients and spectra are gone when planes are propagated, and the field fills up plane by plane.
-        working = max(reading, propagating) + _SCRATCH
-        values = self.grid.n_voxels * 2 * rank
+        # Transients and spectra are gone when planes are propagated.
+        reading, working = reading + _SCRATCH, propagating + _SCRATCH
+        values, method = self.grid.n_voxels * 2 * rank, "direct" if layout is None else "lattice"
         for precision, size in ((torch.float32, 4), (torch.float16, 2)):
-            if values * size + working <= memory_budget:
-                return PhasorPlan("direct" if layout is None else "lattice", n_freq, rank, precision, values * size, working)
+            plan = PhasorPlan(method, n_freq, rank, precision, values * size, reading, working)
+            if plan.total_bytes <= memory_budget:
+                return plan
         raise MemoryBudgetError(
-            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {(values * 2 + working) / 2**30:.1f} GiB even in half "
+            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB even in half "
             f"precision, the budget is {memory_budget / 2**30:.1f} GiB; sum time bins or spots (scene.sum_bins, scene.sum_spots), "
             "shorten scene.volume.depth, widen scene.volume.depth_pitch, or raise memory_budget"
         )

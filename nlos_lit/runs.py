@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 from omegaconf import OmegaConf
 
@@ -21,12 +20,14 @@ from nlos_lit.capture import Capture
 from nlos_lit.effects import Extension, Scan, build_effects
 from nlos_lit.errors import UserError
 from nlos_lit.geometry_metrics import SurfaceTruth
-from nlos_lit.memory import check_machine, parse_bytes
+from nlos_lit.memory import check_machine, parse_bytes, resident_bytes, run_bytes
 from nlos_lit.module import SelfCalibration
 from nlos_lit.progress import planes_progress
 from nlos_lit.scan import volume_grid
 
 log = logging.getLogger(__name__)
+
+LATER_LIBRARIES = 200 * 2**20  # what logging, figures and export load after the estimate
 
 _MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_planes")
 
@@ -43,6 +44,11 @@ class Run:
     setup_seconds: float
     estimated_bytes: int
     extension: Extension
+
+
+def pipeline_settings(model: Mapping[str, Any]) -> PipelineSettings:
+    """What the pipeline takes of a ``model`` config; the rest is the optimiser's."""
+    return PipelineSettings(**{name: value for name, value in model.items() if name not in _MODULE_KEYS})
 
 
 def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -> Run:
@@ -65,14 +71,13 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
         monitor_spots=config["heldout"]["monitor_spots"],
         seed=seed,
     )
-    settings = {name: value for name, value in config["model"].items() if name not in _MODULE_KEYS}
-    pipeline = build_pipeline(capture, grid, PipelineSettings(**settings)).to(device)
+    settings = pipeline_settings(config["model"])
+    pipeline = build_pipeline(capture, grid, settings).to(device)
     plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]))
-    rays = settings["rays"] ** 2 * config["batch_spots"]
-    # Beyond what the process holds already: albedo with its gradient and Adam's two moments, dense ray tables, a chunk of samples.
-    planned = plan.total_bytes + 16 * grid.n_voxels + 24 * rays + 400 * 2**20
+    rays = settings.rays ** 2 * config["batch_spots"]
+    planned = run_bytes(plan, grid.n_voxels, rays) + LATER_LIBRARIES
     check_machine(planned, "this run")
-    estimated = planned + psutil.Process().memory_info().rss
+    estimated = planned + resident_bytes()
     log.info(
         "%s: %d spots x %d bins of %.3g ps, %s; volume %d x %d x %d voxels, depth %.3g to %.3g m",
         scene["name"], capture.n_spots, capture.n_bins, capture.bin_width_ps, capture.kind, *grid.shape[1:], grid.shape[0],
