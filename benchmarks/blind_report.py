@@ -93,9 +93,7 @@ def confusion(cases: list[dict]) -> list[tuple[str, dict[str, int]]]:
 
 
 def line(name: str, case: dict) -> str:
-    hidden = ", ".join(
-        f"{n} ({STRENGTHS[s]})" for n, s in zip(case["spec"]["effects"], case["spec"]["strengths"], strict=True)
-    )
+    hidden = ", ".join(f"{n} ({STRENGTHS[s]})" for n, s in zip(case["spec"]["effects"], case["spec"]["strengths"], strict=True))
     said = ", ".join("/".join(group(case, n)) for n in case["named"]) or "–"
     wrong = "; ".join(f"{q} {s:+.1f} σ, {r:+.0%}" for found in case["errors"].values() for q, (s, r) in found.items())
     cells = (

@@ -2,9 +2,9 @@
 
 Every depth and frequency is propagated by FFT in every iteration, every ray is sampled from the wall to the volume's far corner,
 and every path is spread over all time bins. What the formulation leaves open is taken in its favour: one FFT of the wall's field
-per frequency and one inverse per depth; distances once per depth; frequencies only within 5/σ of Ω_pf
-(4/σ changes gradients by 1 %); the propagation's gradient written out; only rays that meet something become paths. Planes and rays are worked on in blocks
-that fit memory, and what the backward pass needs of a block is computed again, as it would otherwise take tens of GiB.
+per frequency and one inverse per depth; distances once per depth; frequencies only within 5/σ of Ω_pf (at 4/σ gradients are off
+by 1 %); the propagation's gradient written out; only rays that meet something become paths. Planes and rays are worked on in
+blocks that fit memory, and what the backward pass needs of a block is computed again, as it would otherwise take tens of GiB.
 """
 
 from __future__ import annotations
