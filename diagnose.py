@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import shutil
 import sys
 import time
 from pathlib import Path
@@ -13,8 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from data_modules.scenes import load_scene
-from nlos_lit.build import PipelineSettings
-from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
+from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, stay_in_run, write_config
 from nlos_lit.criticism.base import BasePipeline
 from nlos_lit.criticism.criticise import CriticismSettings
 from nlos_lit.criticism.plots import diagnosis_figures
@@ -23,7 +24,8 @@ from nlos_lit.criticism.run import diagnose
 from nlos_lit.criticism.verdict import verdict
 from nlos_lit.errors import UserError
 from nlos_lit.memory import parse_bytes
-from nlos_lit.runs import open_run
+from nlos_lit.progress import StepTicker
+from nlos_lit.runs import open_run, pipeline_settings
 from nlos_lit.surfel_fit import RefineSettings
 
 log = logging.getLogger(__name__)
@@ -48,7 +50,7 @@ def main(config: DictConfig) -> None:
     options = CriticismSettings(**settings["criticism"])
     pipeline = BasePipeline(
         volume=scene["volume"],
-        model=PipelineSettings(**{k: v for k, v in model.items() if k in PipelineSettings.__dataclass_fields__}),
+        model=pipeline_settings(model),
         surfels=RefineSettings(**settings["surfels"]),
         budget=parse_bytes(settings["memory_budget"]),
     )
@@ -56,11 +58,18 @@ def main(config: DictConfig) -> None:
     if run is not None:
         with torch.no_grad():
             image = run.module.pipeline.phasor().cpu(), run.module.pipeline.phasor.grid
-    diagnosis, _ = diagnose(
-        capture, pipeline, options, name=scene["name"], seed=settings["seed"], image=image,
-        toys_folder=folder / "diagnosis" / "toys", tell=lambda text: log.info("%.0f s: %s", time.perf_counter() - began, text),
-    )  # fmt: skip
+    kept = {"scene": scene, "model": model, **{key: settings[key] for key in ("surfels", "criticism", "seed")}}
+    try:
+        with StepTicker("diagnosis") as ticker:
+            diagnosis, _ = diagnose(
+                capture, pipeline, options, name=scene["name"], seed=settings["seed"], image=image,
+                folder=folder / "diagnosis", settings=json.dumps(kept, indent=1, default=str), report=ticker.step,
+            )  # fmt: skip
+    except KeyboardInterrupt:
+        log.warning("interrupted; the same command with hydra.run.dir=%s goes on where it was", folder)
+        sys.exit(130)
     page = write_report(diagnosis, folder / "diagnosis")
+    shutil.rmtree(folder / "diagnosis" / "steps")
     log_figures(folder, diagnosis_figures(diagnosis))
     log.info("%s", verdict(diagnosis))
     log.info("%.0f s; %s", time.perf_counter() - began, page)
@@ -69,4 +78,5 @@ def main(config: DictConfig) -> None:
 if __name__ == "__main__":
     quote_numbers(sys.argv)
     refuse_finished_folder(sys.argv[1:], diagnosis=True)
+    stay_in_run(sys.argv)
     main()

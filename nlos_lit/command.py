@@ -49,6 +49,19 @@ def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> Non
         sys.exit(2)
 
 
+def stay_in_run(arguments: list[str]) -> None:
+    """``run=FOLDER`` keeps log and config in FOLDER/diagnosis, too; in place. Exit where FOLDER is not a run's."""
+    given = dict(item.split("=", 1) for item in arguments if "=" in item)
+    if given.get("run", "null") == "null":
+        return
+    folder = Path(given["run"].strip("'\""))
+    if not (folder / "config.yaml").exists():
+        print(f"error: {folder} is not the folder of a finished run: config.yaml is missing", file=sys.stderr)
+        sys.exit(2)
+    if "hydra.run.dir" not in given:
+        arguments += [f"hydra.run.dir='{folder}'", "hydra.output_subdir=diagnosis/.hydra"]
+
+
 def quote_numbers(arguments: list[str]) -> None:
     """``scene=34`` → ``scene='34'`` in place: Hydra would take a scene whose name is a number for a number."""
     for index, argument in enumerate(arguments):

@@ -42,6 +42,35 @@ class Ticker:
             self.bar.stop()
 
 
+class StepTicker:
+    """Progress of work whose steps differ and whose length is estimated on the way; as a context it closes its bar."""
+
+    def __init__(self, what: str) -> None:
+        console = Console(stderr=True)
+        self.bar: Progress | None = None
+        if console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"), TimeElapsedColumn())
+            self.bar = Progress(*columns, TextColumn("{task.fields[left]}"), console=console)
+            self.task = self.bar.add_task(what, total=None, note="", left="")
+
+    def step(self, text: str, passed: float, left: float) -> None:
+        """What begins now, seconds since the start, seconds left (0: not known)."""
+        ahead = f"about {left:.0f} s left" if left else ""
+        if self.bar is not None:
+            self.bar.update(self.task, completed=passed, total=passed + left if left else None, note=text, left=ahead)
+        else:
+            log.info("%.0f s: %s%s", passed, text, f", {ahead}" if ahead else "")
+
+    def __enter__(self) -> StepTicker:
+        if self.bar is not None:
+            self.bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.stop()
+
+
 @contextmanager
 def planes_progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """A ``progress(done, total)`` callback that opens its bar at the first call."""

@@ -32,6 +32,7 @@ def diagnose(
     seed: int,
     image: tuple[Tensor, VolumeGrid] | None = None,
     folder: Path | None = None,
+    settings: str = "",
     report: Report = lambda text, passed, left: None,
 ) -> tuple[Diagnosis, Findings]:
     """Fit, criticise, measure.
@@ -41,7 +42,7 @@ def diagnose(
         image: ``[nz, nx, ny]`` and its grid, where a run has made it already.
         folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same arguments goes on; needed
             with ``options.toys``.
-        report: see :class:`~nlos_lit.criticism.steps.Steps`.
+        settings, report: see :class:`~nlos_lit.criticism.steps.Steps`.
 
     Raises:
         UserError: the scan is too small to be split, the capture holds no counts but expectations, or no surface is found.
@@ -50,7 +51,7 @@ def diagnose(
     if not capture.is_counts:
         raise UserError("a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first")
     split, scan = split_spots(capture), Scan.of(capture)
-    steps = Steps(report, None if folder is None else folder / "steps")
+    steps = Steps(report, None if folder is None else folder / "steps", settings)
     steps.share({"capture": capture, "settings": pipeline.surfels})
     steps.plan(image=image is None, fit=1 + options.finalists, screen=2, refit=1 + options.rivals, check=options.numerics)
     if image is None:

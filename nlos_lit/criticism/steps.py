@@ -9,7 +9,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from nlos_lit.errors import UserError
+
 T = TypeVar("T")
+SETTINGS = "settings.json"
 Report = Callable[[str, float, float], None]
 # What a step takes, in base fits, until one of its kind has been timed.
 SHARE = {"image": 0.3, "fit": 1.0, "screen": 1.0, "refit": 0.3, "check": 1.0}
@@ -21,11 +24,20 @@ class Steps:
     Args:
         report: called at the start of each step with what it is, seconds since the start, and seconds that are left (an estimate,
             for the turn at hand).
-        folder: where results of steps are kept; None keeps nothing. The same settings and seed must have made what is there.
+        folder: where results of steps are kept; None keeps nothing.
+        settings: all that results depend on, as text.
+
+    Raises:
+        UserError: other settings have made what is there.
     """
 
-    def __init__(self, report: Report = lambda text, passed, left: None, folder: Path | None = None) -> None:
-        self.report, self.folder = report, folder
+    def __init__(self, report: Report = lambda text, passed, left: None, folder: Path | None = None, settings: str = "") -> None:
+        self.report, self.folder, self.settings = report, folder, settings
+        if folder is not None and (folder / SETTINGS).exists() and (folder / SETTINGS).read_text() != settings:
+            raise UserError(
+                f"{folder} holds the steps of an interrupted diagnosis with other settings; go on with the same settings, choose "
+                "another folder, or move it away"
+            )
         self.shared: dict[str, Any] = {}
         self.began, self.taken, self.ahead = time.monotonic(), {}, dict.fromkeys(SHARE, 0)
 
@@ -63,6 +75,7 @@ class Steps:
         whole = io.BytesIO()
         _Pickler(whole, names).dump(result)
         file.parent.mkdir(parents=True, exist_ok=True)
+        (file.parent / SETTINGS).write_text(self.settings)
         part = file.with_suffix(".part")
         part.write_bytes(whole.getvalue())
         part.rename(file)
