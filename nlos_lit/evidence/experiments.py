@@ -20,9 +20,9 @@ EXPERIMENTS: dict[str, Callable[[Workspace, Size], Evidence]] = {
     "figure10": figure10,
     "figure6": figure6,
     "figure7": figure7,
-    "profiles": profiles,
     "figure8": figure8,
     "figure9": figure9,
     "figure5": figure5,
     "supplement2": supplement2,
+    "profiles": profiles,
 }

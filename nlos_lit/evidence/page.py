@@ -60,7 +60,8 @@ def replace_part(text: str, name: str, content: str) -> str:
 def section(name: str, record: dict[str, Any]) -> str:
     """Command, data, table and figures of one experiment."""
     lines = [f"    python results.py {name}", "", f"**Paper**: {record['paper']}", "", f"**Here**: {record['here']}", ""]
-    lines += [markdown(record["rows"]), "", f"[As CSV, at full precision](results/{name}.csv)"]
+    commit = f", commit {record['git']['commit'][:10]}" if record["git"] else ""
+    lines += [markdown(record["rows"]), "", f"[At full precision](results/{name}.csv){commit}"]
     for figure, caption in record["captions"].items():
         lines += ["", f"![{name} {figure}](images/results_{name}_{figure}.png)", "", f"*{caption}*"]
     return "\n".join(lines)

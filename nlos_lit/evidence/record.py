@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from nlos_lit.export import whole_file, write_json
 from nlos_lit.figures import save_figure
+from nlos_lit.summary import git_state
 
 Row = dict[str, Any]
 CLASSICAL = ("bp", "fbp", "lct", "dlct", "fk", "rsd")
@@ -107,7 +108,8 @@ class Evidence:
         for name, figure in self.figures.items():
             save_figure(figure, folder / f"{name}.png")
         texts = {key: getattr(self, key) for key in ("name", "title", "paper", "here", "rows", "captions")}
-        write_json(folder / "evidence.json", {**texts, "glance": [entry.row() for entry in self.glance]})
+        comparisons = [entry.row() for entry in self.glance]
+        write_json(folder / "evidence.json", {**texts, "glance": comparisons, "git": git_state()})
 
 
 def read_record(folder: Path) -> dict[str, Any]:
