@@ -17,10 +17,7 @@ from nlos_lit.functional.surfel_paths import (
     STEEP,
     Paths,
     SplineSplat,
-    path_rates,
     quadrature,
-    spline_slopes,
-    spline_weights,
     trace,
 )
 from nlos_lit.laser_sensor import LaserSensor
@@ -60,18 +57,6 @@ class Hooks:
 
 
 NOTHING = Hooks()
-
-
-class Columns(NamedTuple):
-    """Derivatives of the transients H_r (before the response) by each surfel's albedo and depth, sparse; normals held.
-
-    Element ``[b, m, q, k]`` belongs to bin ``first[b, m, q] + k`` of spot b, counted from the capture's bin 0; bins outside
-    ``[0, T)`` do not exist. ∂μ/∂θ is the response of the scattered values, see :meth:`SurfelModel.image`.
-    """
-
-    first: Tensor  # [B, M, Q] long
-    albedo: Tensor  # [B, M, Q, 4] ∂H_r/∂ρ
-    depth: Tensor  # [B, M, Q, 4] ∂H_r/∂z, 1/m
 
 
 class Lateral(NamedTuple):
@@ -193,11 +178,11 @@ class SurfelModel(nn.Module):
         if not self.confocal:
             self.visible &= seen(self.sensor)
 
-    def paths(self, spots: Tensor, centre: Tensor | None = None) -> Paths:
-        """Stage 1: all paths of ``spots`` ``[B]`` over all surfels (at ``centre`` where given), for unit albedo."""
+    def paths(self, spots: Tensor) -> Paths:
+        """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
-        paths = trace(self.centre() if centre is None else centre, self.normal(), self.cell, offsets, *walls, self.confocal)
+        paths = trace(self.centre(), self.normal(), self.cell, offsets, *walls, self.confocal)
         if len(self.visible):
             paths = paths._replace(contribution=paths.contribution * self.visible[spots][:, :, None])
         return paths
@@ -241,20 +226,6 @@ class SurfelModel(nn.Module):
         """:meth:`render` without gradients, in batches of about two million paths."""
         size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
         return torch.cat([self.render(part, hooks) for part in spots.split(size)])
-
-    def columns(self, spots: Tensor) -> Columns:
-        """Sparse ∂H_r/∂albedo and ∂H_r/∂depth of every surfel at ``spots`` ``[B]``; memory 13 numbers per path."""
-        centre, normal = self.centre().detach(), self.normal().detach()
-        walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
-        offsets = quadrature(self.quadrature, self.anchor.device)
-        energy, length = self.paths(spots)[:2]
-        energy, time = energy.detach(), self.arrival(length.detach())
-        rate, stretch = path_rates(centre, normal, self.cell, offsets, self.direction, *walls, self.confocal)
-        d_energy, d_time = energy * rate, stretch / self.bin_length
-        first, weights = spline_weights(time)
-        by_depth = d_energy[..., None] * weights + (energy * d_time)[..., None] * spline_slopes(time)
-        albedo = self.albedo().detach()[:, None, None]
-        return Columns(first, energy[..., None] * weights, albedo * by_depth)
 
     def points(self) -> Points:
         """Surfel centres with normals and albedo."""

@@ -1,4 +1,4 @@
-"""Surfels: hand-computed transients, energy, gradients, sparse columns, visibility."""
+"""Surfels: hand-computed transients, energy, gradients, visibility."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import torch
 from data_modules.simulate import ScanPlan, simulate_transients
 from data_modules.simulate.scenes import plate
 from nlos_lit.capture import Capture
-from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
-from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, scatter_bins, spline_weights, spread
+from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
 from nlos_lit.parameters import BoundedParameter
 from nlos_lit.surfels import NOTHING, Hooks, Lateral, SurfelModel, spline_sensor
 
@@ -154,23 +153,6 @@ def test_gradient_of_render_agrees_with_finite_differences(name):
                 sides.append(value().item())
                 parameter[index] -= sign * step
         assert gradient[index].item() == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3, abs=1e-6)
-
-
-def test_columns_are_the_gradient_of_render():
-    """Random projections of the sparse columns, spot by spot, against reverse mode."""
-    model, spots = random_model()
-    columns, sensor = model.columns(spots), model.laser_sensor
-    for seed, spot in ((0, 0), (1, 1), (2, 2)):
-        probe = torch.randn(260, generator=torch.Generator().manual_seed(seed))
-        value = (model.render(spots)[spot] * probe).sum()
-        by_depth, by_albedo = torch.autograd.grad(value, (model.raw_depth, model.raw_albedo))
-        units = (model.bin_length / 2, torch.sigmoid(model.raw_albedo).detach())
-        for values, gradient, unit in zip((columns.depth, columns.albedo), (by_depth, by_albedo), units, strict=True):
-            # One row for each surfel of this spot.
-            sparse = scatter_bins(values[spot], columns.first[spot], model.n_bins)
-            image = sensor.intensity() * convolve_time(sparse, sensor.kernel(), sensor.lead)
-            projected = (image[:, 40:] @ probe * unit).detach()
-            assert torch.allclose(projected, gradient, atol=1e-3 * gradient.abs().max().item())
 
 
 def _with(model, depth, albedo, spots):

@@ -102,40 +102,6 @@ def _leg(points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tenso
     return at_wall * plane / square**2, distance, plane / distance
 
 
-def path_rates(
-    centre: Tensor,
-    normal: Tensor,
-    cell: Tensor,
-    offsets: Tensor,
-    direction: Tensor,
-    laser: Tensor,
-    laser_normal: Tensor,
-    sensor: Tensor,
-    sensor_normal: Tensor,
-    confocal: bool,
-) -> tuple[Tensor, Tensor]:
-    """Derivatives of :func:`trace` when every surfel moves along its ``direction`` ``[M, 3]``, both ``[B, M, Q]``: of the
-    contribution's logarithm (1/m) and of the length (m per m). A path depends on its own surfel alone."""
-    shift, _ = spread(normal, cell, offsets)
-    points = (centre[:, None] + shift).unbind(2)
-    rate, length = _leg_rate(points, normal, direction, laser, laser_normal)
-    if confocal:
-        return 2 * rate, 2 * length
-    other_rate, other_length = _leg_rate(points, normal, direction, sensor, sensor_normal)
-    return rate + other_rate, length + other_length
-
-
-def _leg_rate(points: tuple[Tensor, ...], facing: Tensor, direction: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Along ``direction``: derivatives of ln(cosθ_wall cosθ_surfel / d²) and of d, each ``[B, M, Q]``."""
-    d = torch.stack([p - wall[:, k, None, None] for k, p in enumerate(points)], -1)
-    square = (d * d).sum(-1)
-    away = (d * direction[:, None]).sum(-1)
-    at_wall = torch.einsum("bmqk,bk->bmq", d, normal).clamp_min(1e-9)
-    plane = -(d[:, :, :1] * facing[:, None]).sum(-1).clamp_max(-1e-9)
-    rate = (normal @ direction.T)[:, :, None] / at_wall - ((facing * direction).sum(1)[:, None] / plane) - 4 * away / square
-    return rate, away / square.sqrt()
-
-
 def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
     """Cubic B-spline shares of an arrival at ``time`` (bins; bin k is centred on k + ½).
 
