@@ -121,7 +121,7 @@ def figure8(work: Workspace, size: Size) -> Evidence:
     subject = bunny(work, size)
     scene = work.open(subject)
     folder = full_model(work, size)
-    published = work.train("bunny_paper", subject, "model=paper", "refine=true")
+    published = work.train("bunny_paper", subject, "model=paper")
     systems: dict[str, Points] = {
         "published system": run_points(published, refined=False),
         "ours, phasor surface": run_points(folder, refined=False),
