@@ -2,7 +2,7 @@
 
 Every depth and frequency is propagated by FFT in every iteration, every ray is sampled from the wall to the volume's far corner,
 and every path is spread over all time bins. What the formulation leaves open is taken in its favour: one FFT of the wall's field
-per frequency and one inverse per depth; distances once per depth; frequencies only within 5/σ of Ω_pf (at 4/σ gradients are off
+per frequency and one inverse per depth; distances once per depth; frequencies only within 5.5/σ of Ω_pf (at 4/σ gradients are off
 by 1 %); the propagation's gradient written out; only rays that meet something become paths. Planes and rays are worked on in
 blocks that fit memory, and what the backward pass needs of a block is computed again, as it would otherwise take tens of GiB.
 """
@@ -56,7 +56,7 @@ class LiteralIteration:
         if not capture.confocal or phasor.power != 2 or geometry.fine != 1 or geometry.relative:
             raise ValueError("the literal iteration is written for confocal captures and the profile 'paper'")
         centre, sigma = float(phasor.omega_pf().detach()), float(phasor.sigma_pf().detach())
-        self.omega = phasor.omega[(phasor.omega - centre).abs() <= 5 / sigma]
+        self.omega = phasor.omega[(phasor.omega - centre).abs() <= 5.5 / sigma]
         first, last = capture.gate
         time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length
         nx, ny = capture.scan_shape
@@ -84,13 +84,14 @@ class LiteralIteration:
     def step_on(self, spots: Tensor, counts: Tensor) -> Tensor:
         """Forward, backward, Adam."""
         self.training.optimiser.zero_grad()
-        loss = self.loss(spots, counts)
+        loss = self.terms(spots, counts)["loss"]
         loss.backward()
         self.training.optimiser.step()
         self.training.steps += 1
         return loss.detach()
 
-    def loss(self, spots: Tensor, counts: Tensor) -> Tensor:
+    def terms(self, spots: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """The data term and the whole objective."""
         pipeline, criterion = self.pipeline, self.training.criterion
         phasor = pipeline.phasor
         self.aperture = torch.fft.fft2(self.field, s=self.padded)
@@ -101,9 +102,9 @@ class LiteralIteration:
         albedo = pipeline.albedo(intensity)
         rendered = self.render(intensity, albedo, spots)
         expected = pipeline.laser_sensor(rendered)[:, pipeline.gate[0] :]
-        loss = transient_loss(counts / criterion.scale, expected / criterion.scale)
+        data = transient_loss(counts / criterion.scale, expected / criterion.scale)
         planes = criterion.voxel_batch(albedo, self.training.steps)
-        return loss + sum(criterion.regularisation(intensity, planes).values())
+        return {"transient": data, "loss": data + sum(criterion.regularisation(intensity, planes).values())}
 
     def at(self, volume: Tensor, points: Tensor) -> Tensor:
         """Trilinear ``[…]`` at ``[…, 3]``, zero outside the box of voxel centres."""

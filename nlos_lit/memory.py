@@ -48,14 +48,13 @@ def resident_bytes() -> int:
 def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     """What a run takes beyond what its process holds before the field is propagated.
 
-    Measured parts: a voxel costs an iteration about 18 numbers (intensity, albedo, gradients, Adam's moments); a ray 80
-    bytes of directions and tables, and a tenth of the rays meet something, 0.6 kB each. Matching the energy looks at twice the
-    spots of an iteration, without gradients.
+    Measured parts: a voxel costs an iteration about 18 numbers (intensity, albedo, gradients, Adam's moments), a ray 120 bytes of
+    directions, tables and the tenth of rays that meet something. Matching the energy looks at twice the spots without gradients.
 
     Args:
         n_voxels: of the volume.
         rays: of all spots of an iteration together.
     """
-    iterating = 72 * n_voxels + 140 * rays
-    matching = 24 * n_voxels + 280 * rays
+    iterating = 72 * n_voxels + 120 * rays
+    matching = 24 * n_voxels + 180 * rays
     return max(plan.total_bytes, plan.field_bytes + max(iterating, matching) + _SCRATCH)

@@ -65,3 +65,8 @@ def adam(pipeline: Pipeline, rates: dict[str, float], optimised: list[str]) -> t
     """Adam on the unconstrained parameters of the groups ``optimised``, each at its rate."""
     groups = parameter_groups(pipeline)
     return torch.optim.Adam([{"params": groups[name], "lr": rates[name], "name": name} for name in optimised])
+
+
+def communicated_bytes(pipeline: Pipeline) -> int:
+    """Gradients that each process of a distributed run hands over in an iteration (a ring sends this about twice)."""
+    return sum(p.numel() * p.element_size() for group in parameter_groups(pipeline).values() for p in group)

@@ -89,9 +89,12 @@ class Rotation:
         return result
 
 
-def runs(n: int, size: int) -> list[slice]:
-    """0 … n in runs whose n × size complex numbers fill 16 MiB: small enough for caches and for memory to be used again."""
-    most = max(1, (1 << 21) // size)
+def runs(n: int, size: int, device: torch.device) -> list[slice]:
+    """0 … n in runs whose n × size complex numbers fill 16 MiB, small enough for caches and for memory to be used again.
+
+    On a GPU 1 GiB, so that it has enough to do at once.
+    """
+    most = max(1, (1 << 21 if device.type == "cpu" else 1 << 27) // size)
     return [slice(i, min(i + most, n)) for i in range(0, n, most)]
 
 

@@ -105,7 +105,7 @@ def lattice_phasors(
     x, y = (EvenAxis(n, m, o, device) for n, m, o in zip((nx, ny), shape, offset, strict=True))
     folded = (4, x.half, y.half) if fixed is None else (x.length, y.length)
     spectra = torch.empty(n_scans, n_freq, *folded, dtype=torch.complex64, device=device)
-    for scan, part in itertools.product(range(n_scans), runs(n_freq, x.length * y.length)):
+    for scan, part in itertools.product(range(n_scans), runs(n_freq, x.length * y.length, device)):
         shifted = torch.fft.fft2(field[scan, part], s=(x.length, y.length)) * (x.shift[:, None] * y.shift)
         spectra[scan, part] = fold(shifted, x, y) if fixed is None else shifted
     del field, shifted
@@ -113,13 +113,16 @@ def lattice_phasors(
     weights = basis.to(device=device, dtype=torch.float32)
     if fixed is None:
         step, wave = 2 * _step(omega), 2 * omega.to(device)
-        parts, spread = runs(n_freq, x.half * y.half), torch.empty(n_freq, x.half, y.half, dtype=torch.complex64, device=device)
+        parts, spread = (
+            runs(n_freq, x.half * y.half, device),
+            torch.empty(n_freq, x.half, y.half, dtype=torch.complex64, device=device),
+        )
         for z in depth.tolist():
             kernel = Rotation(torch.sqrt(lateral + z * z), step, n_freq, 2)
             for part in parts:
                 spread[part] = even_transform(kernel.values(wave, part), x, y)
             mixed = torch.empty(rank, *folded, 2, device=device)
-            for quarter, rows in itertools.product(range(4), runs(x.half, n_freq * y.half)):
+            for quarter, rows in itertools.product(range(4), runs(x.half, n_freq * y.half, device)):
                 product = spectra[0, :, quarter, rows] * spread[:, rows]
                 mixed[:, quarter, rows] = (weights.T @ _real_rows(product)).view(rank, -1, y.half, 2)
             yield _voxels_first(inverse(unfold(torch.view_as_complex(mixed), x, y), *shape))
@@ -132,7 +135,7 @@ def lattice_phasors(
         to_fixed = [torch.sqrt((xs[:, None] - p[0]) ** 2 + (ys - p[1]) ** 2 + (z - p[2]) ** 2) for p in fixed.to(device)]
         legs = [Rotation(distance, step, n_freq, 1) for distance in to_fixed]
         mixed = torch.zeros(rank, shape[0] * shape[1] * 2, device=device)
-        for part in runs(n_freq, x.length * y.length):
+        for part in runs(n_freq, x.length * y.length, device):
             spread = mirror(mirror(even_transform(kernel.values(wave, part), x, y), 1, x), 2, y)
             for scan, leg in enumerate(legs):
                 arrived = inverse(spectra[scan, part] * spread, *shape)
