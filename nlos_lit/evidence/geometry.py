@@ -23,9 +23,7 @@ BOTH = "RMSE, mean of both ways (mm)"
 
 def trainings(work: Workspace, size: Size, subject: Subject) -> dict[str, Path]:
     """The published system's and our training on a subject."""
-    paper = work.train(
-        f"{subject.name}_paper", subject, "model=paper", "refine=true" if subject.name == "bunny" else "refine=false"
-    )
+    paper = work.train(f"{subject.name}_paper", subject, "model=paper")
     ours = full_model(work, size) if subject.name == "bunny" else work.train(subject.name, subject, "refine=true")
     return {"paper": paper, "ours": ours}
 

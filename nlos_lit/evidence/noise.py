@@ -45,7 +45,8 @@ def figure6(work: Workspace, size: Size) -> Evidence:
         levels.append(f"{counts} counts\n{noise:.1f} dB")
         rows += [{"counts a spot": counts, "SNR (dB)": noise, "system": name, **_row(entry)} for name, entry in found.items()]
         limits = tuple(np.nanquantile(scene.truth.depth, (0.01, 0.99)))
-        maps.append([plots.Image(entry["depth"], "depth", limits) for entry in found.values()])
+        shown = [found.get(name) for name in (*METHODS, *OURS)]
+        maps.append([None if entry is None else plots.Image(entry["depth"], "depth", limits) for entry in shown])
     names = [*METHODS, *OURS]
     panels = [
         plots.Panel(
@@ -83,10 +84,9 @@ def _curve(rows: list[Row], name: str, what: str) -> tuple[list[float], list[flo
 
 
 def _level(work: Workspace, size: Size, subject: Subject, scene: Scene) -> dict[str, Arrays]:
-    runs = {
-        "paper": work.train(f"{subject.name}_paper", subject, "model=paper"),
-        "ours": work.train(subject.name, subject, "refine=true"),
-    }
+    runs = {"ours": work.train(subject.name, subject, "refine=true")}
+    if subject.name in (f"bunny_{size.counts[0]}", f"bunny_{size.counts[-1]}"):
+        runs["paper"] = work.train(f"{subject.name}_paper", subject, "model=paper")
 
     def entry(points: Points, chosen: dict[str, float]) -> dict[str, Any]:
         errors = {f"row_{key}": value for key, value in geometry_row(errors_of(points, scene)).items()}
@@ -94,10 +94,8 @@ def _level(work: Workspace, size: Size, subject: Subject, scene: Scene) -> dict[
 
     found = {}
     for name in METHODS:
-        compute = lambda name=name: entry(*classical_points(scene, name, size.snrs))  # noqa: E731
-        found[name] = work.kept(f"figure6/{subject.name}_{name}", compute)
-    for name, (run, take) in OURS.items():
-        found[name] = entry(take(runs[run], scene), {})
+        found[name] = work.kept(f"figure6/{subject.name}_{name}", lambda m=name: entry(*classical_points(scene, m, size.snrs)))
+    found |= {name: entry(take(runs[run], scene), {}) for name, (run, take) in OURS.items() if run in runs}
     return found
 
 
@@ -110,5 +108,5 @@ def _row(entry: Arrays) -> Row:
 def _glance(rows: list[Row], counts: int, what: str, higher: bool) -> Glance:
     value = {row["system"]: row[what] for row in rows if row["counts a spot"] == counts}
     classical = {name: v for name, v in value.items() if name in CLASSICAL}
-    return Glance(f"{what}, {counts} counts a spot", "bunny, own simulator", value["published system"], classical,
+    return Glance(f"{what}, {counts} counts a spot", "bunny, own simulator", value.get("published system"), classical,
                   value["ours, phasor surface"], value["ours, refined"], higher)  # fmt: skip

@@ -57,8 +57,7 @@ def profiles(work: Workspace, size: Size) -> Evidence:
 
 
 def _runs(work: Workspace, size: Size, subject: Subject, ours: Path, measured: bool) -> dict[str, tuple[Path, bool]]:
-    refine = "refine=true" if subject.name == "bunny" else None
-    paper = work.train(f"{subject.name}_paper", subject, "model=paper", *([refine] if refine else []))
+    paper = work.train(f"{subject.name}_paper", subject, "model=paper")
     code = work.train(f"{subject.name}_code", subject, "model=reference_code")
     runs = {"paper": (paper, False), "reference_code": (code, False), "default": (ours, False), "default, refined": (ours, True)}
     for effects in size.effects if measured else ():
