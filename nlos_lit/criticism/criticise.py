@@ -54,7 +54,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 1e-3
     least_gain: float = 25.0
-    least_share: float = 0.03
+    least_share: float = 0.02
     rivals: int = 5
     hopeless: float = 0.2
     finalists: int = 3
@@ -171,7 +171,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     if not trials:
         return Turn(candidates, rest, [], None, [], controls)
     best = choose(trials, block)
-    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested / 2:
+    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested:
         return Turn(candidates, rest, trials, None, [], controls)
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar), controls)
 
