@@ -57,4 +57,4 @@ def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     """
     iterating = 72 * n_voxels + 120 * rays
     matching = 24 * n_voxels + 180 * rays
-    return max(plan.total_bytes, plan.field_bytes + max(iterating, matching) + _SCRATCH)
+    return max(plan.total_bytes, plan.resident_bytes + max(iterating, matching) + _SCRATCH)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -14,6 +16,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError
 from nlos_lit.functional import phasor as F
 from nlos_lit.functional.even import convolution_length
+from nlos_lit.functional.streamed import SLAB_BYTES, FieldFile, StreamedMagnitude
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.parameters import BoundedParameter
 from nlos_lit.scan import ScanGeometry, path_range, scan_geometry
@@ -31,17 +34,23 @@ class PhasorPlan:
     n_frequencies: int
     rank: int
     precision: torch.dtype
+    on_disk: bool  # whether the field is read from a file in every iteration
     field_bytes: int
     reading_bytes: int  # transients and their spectra, before there is a field
     working_bytes: int  # beside the field while it is propagated
 
     @property
+    def resident_bytes(self) -> int:
+        """What of the field stays in memory."""
+        return 2 * SLAB_BYTES if self.on_disk else self.field_bytes
+
+    @property
     def total_bytes(self) -> int:
         """Largest while the field is made."""
-        return max(self.reading_bytes, self.field_bytes + self.working_bytes)
+        return max(self.reading_bytes, self.resident_bytes + self.working_bytes)
 
     def __str__(self) -> str:
-        kind = str(self.precision).removeprefix("torch.")
+        kind = str(self.precision).removeprefix("torch.") + (" on disk" if self.on_disk else "")
         return (
             f"phasor basis by {'FFT convolution' if self.method == 'lattice' else 'direct sum'}: {self.n_frequencies} frequencies "
             f"in {self.rank} dimensions, {self.field_bytes / 2**30:.2f} GiB {kind} + {self.working_bytes / 2**30:.2f} GiB working"
@@ -91,16 +100,17 @@ class PhasorImaging(nn.Module):
         self.grid, self.omega_pf, self.sigma_pf = grid, omega_pf, sigma_pf
         self.power, self.tolerance = float(power), tolerance
         self.register_buffer("field", torch.empty(0), persistent=False)
+        self.file: FieldFile | None = None  # holds the field instead, where it is streamed
         self.register_buffer("basis", torch.empty(0), persistent=False)
         self.register_buffer("omega", torch.empty(0), persistent=False)
         gain = torch.tensor(grid.z / grid.z.max(), dtype=torch.float32) ** depth_exponent
         self.register_buffer("gain", gain[:, None, None], persistent=False)
 
     def plan(self, capture: Capture, memory_budget: int) -> PhasorPlan:
-        """Frequencies, rank, precision and bytes for this capture.
+        """Frequencies, rank, precision, place and bytes for this capture: single precision in memory, half, or single on disk.
 
         Raises:
-            MemoryBudgetError: not even half precision fits ``memory_budget`` bytes.
+            MemoryBudgetError: not even what propagates the field fits ``memory_budget`` bytes, or the disk is too small.
         """
         omega = self._frequencies(capture)
         bounds = (self.omega_pf.lower, self.omega_pf.upper), (self.sigma_pf.lower, self.sigma_pf.upper)
@@ -109,9 +119,7 @@ class PhasorImaging(nn.Module):
         n_freq, rank = self.basis.shape
         layout = self._layout(capture)
         first, last = self._window(capture)
-        reading = (
-            4 * capture.n_spots * (last - first) * 2 + 16 * capture.n_spots * n_freq
-        )  # counts twice, two halves of the spectrum
+        reading = capture.n_spots * (8 * (last - first) + 16 * n_freq)  # counts twice, the spectrum and its two halves
         if layout is None:
             propagating = capture.n_spots * (8 * n_freq + 256 * 96)
         else:
@@ -120,14 +128,15 @@ class PhasorImaging(nn.Module):
         # Transients and spectra are gone when planes are propagated.
         reading, working = reading + _SCRATCH, propagating + _SCRATCH
         values, method = self.grid.n_voxels * 2 * rank, "direct" if layout is None else "lattice"
-        for precision, size in ((torch.float32, 4), (torch.float16, 2)):
-            plan = PhasorPlan(method, n_freq, rank, precision, values * size, reading, working)
-            if plan.total_bytes <= memory_budget:
+        for precision, size, on_disk in ((torch.float32, 4, False), (torch.float16, 2, False), (torch.float32, 4, True)):
+            plan = PhasorPlan(method, n_freq, rank, precision, on_disk, values * size, reading, working)
+            if plan.total_bytes <= memory_budget and not (on_disk and plan.field_bytes > _free_disk()):
                 return plan
         raise MemoryBudgetError(
-            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB even in half "
-            f"precision, the budget is {memory_budget / 2**30:.1f} GiB; sum time bins or spots (scene.sum_bins, scene.sum_spots), "
-            "shorten scene.volume.depth, widen scene.volume.depth_pitch, or raise memory_budget"
+            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB of memory and "
+            f"{plan.field_bytes / 2**30:.1f} GiB of temporary disk even when it is streamed, the budget is "
+            f"{memory_budget / 2**30:.1f} GiB (disk: {_free_disk() / 2**30:.1f} GiB); sum time bins or spots (scene.sum_bins, "
+            "scene.sum_spots), shorten scene.volume.depth, widen scene.volume.depth_pitch, or raise memory_budget"
         )
 
     @torch.no_grad()
@@ -139,7 +148,7 @@ class PhasorImaging(nn.Module):
         spots: np.ndarray | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]``.
+        """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]`` (or its file).
 
         Args:
             progress: called with (planes or blocks done, of how many).
@@ -154,11 +163,16 @@ class PhasorImaging(nn.Module):
         else:
             blocks, total = self._lattice(layout, spectrum), self.grid.shape[0]
         del spectrum  # the propagation drops it, too, as soon as it can
-        field = torch.empty(self.grid.n_voxels, 2, self.basis.shape[1], dtype=plan.precision, device=self.gain.device)
+        shape, device = (self.grid.n_voxels, 2, self.basis.shape[1]), self.gain.device
+        self.file = FieldFile(shape, device) if plan.on_disk else None
+        field = torch.empty((0,) if plan.on_disk else shape, dtype=plan.precision, device=device)
         row = 0
         for done, block in enumerate(blocks, start=1):
             torch.div(block, scale, out=block)
-            field[row : row + len(block)] = block
+            if self.file is not None:
+                self.file.append(block)
+            else:
+                field[row : row + len(block)] = block
             row += len(block)
             if progress is not None:
                 progress(done, total)
@@ -168,7 +182,10 @@ class PhasorImaging(nn.Module):
         """``[nz, nx, ny]`` intensity with a unit maximum."""
         weights = F.virtual_illumination(self.omega, self.omega_pf(), self.sigma_pf())
         mixed = (self.basis.T @ weights.to(self.basis.dtype)).to(torch.float32)
-        magnitude = F.PhasorMagnitude.apply(self.field, mixed).view(self.grid.shape)
+        if self.file is not None:
+            magnitude = StreamedMagnitude.apply(mixed, self.file).view(self.grid.shape)
+        else:
+            magnitude = F.PhasorMagnitude.apply(self.field, mixed).view(self.grid.shape)
         intensity = self.gain * (magnitude if self.power == 1 else magnitude**self.power)
         return intensity / intensity.max()
 
@@ -242,3 +259,7 @@ class PhasorImaging(nn.Module):
         return F.direct_phasors(
             spectrum, self.omega, self.basis, torch.from_numpy(capture.laser), torch.from_numpy(capture.sensor), voxels
         )
+
+
+def _free_disk() -> int:
+    return shutil.disk_usage(tempfile.gettempdir()).free

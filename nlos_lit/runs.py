@@ -27,7 +27,7 @@ from nlos_lit.scan import volume_grid
 
 log = logging.getLogger(__name__)
 
-LATER_LIBRARIES = 200 * 2**20  # what logging, figures and export load after the estimate
+LATER_LIBRARIES = 100 * 2**20  # what logging, figures and export load after the estimate
 
 _MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_planes")
 

@@ -19,7 +19,7 @@ from nlos_lit.grid import VolumeGrid
 from nlos_lit.laser_sensor import LaserSensor
 from nlos_lit.losses import albedo_variation, sparsity, transient_loss
 from nlos_lit.parameters import BoundedParameter
-from nlos_lit.phasor import PhasorImaging
+from nlos_lit.phasor import PhasorImaging, PhasorPlan
 from nlos_lit.pipeline import Pipeline
 from nlos_lit.renderer import TransientRenderer
 from nlos_lit.scan import volume_grid
@@ -157,9 +157,9 @@ def terms_and_gradients(terms: dict[str, torch.Tensor], raw: dict[str, torch.Ten
     return gradients
 
 
-def run_package(world: SimpleNamespace, precision: torch.dtype = torch.float32) -> SimpleNamespace:
+def run_package(world: SimpleNamespace, precision: torch.dtype = torch.float32, plan: PhasorPlan | None = None) -> SimpleNamespace:
     phasor = world.pipeline.phasor
-    phasor.prepare(world.capture, replace(phasor.plan(world.capture, 1 << 32), precision=precision))
+    phasor.prepare(world.capture, plan or replace(phasor.plan(world.capture, 1 << 32), precision=precision))
     rendering = world.pipeline(world.spots)
     rendered, _, _ = world.pipeline.render(rendering.intensity, rendering.albedo, world.spots)
     scale = 400.0
@@ -279,6 +279,21 @@ def test_half_precision_storage(name):
         torch.stack([torch.as_tensor(run.gradients["E_H", p]).double() for p in ("omega_pf", "sigma_pf")]) for run in (half, dense)
     )
     assert literal.relative(found, expected) < 0.05
+
+
+@pytest.mark.parametrize("rows", [1 << 20, 7])
+def test_streamed_field_gives_the_same(rows, monkeypatch):
+    """From a file, in one slab or in many, loss and gradients are those of the field in memory."""
+    monkeypatch.setattr("nlos_lit.functional.streamed.SLAB_BYTES", 8 * 30 * rows)
+    world = build(CASES["refined"])
+    phasor = world.pipeline.phasor
+    plan = replace(phasor.plan(world.capture, 1 << 32), on_disk=True)
+    stored, streamed = both("refined")[1], run_package(world, plan=plan)
+    assert phasor.field.numel() == 0
+    assert literal.relative(streamed.rendering.intensity, stored.rendering.intensity) < 1e-6
+    for name in NAMES:
+        if stored.gradients["E_H", name] is not None:
+            assert literal.relative(streamed.gradients["E_H", name], stored.gradients["E_H", name]) < 1e-4
 
 
 def imaging_at(world: SimpleNamespace, omega_pf: float, sigma_pf: float) -> float:

@@ -227,18 +227,25 @@ def imaging(grid: VolumeGrid, sigma: float = 0.1) -> PhasorImaging:
     return PhasorImaging(grid, BoundedParameter(60.0, 30.0, 90.0, "rad/m"), BoundedParameter(sigma, 0.03, 0.2, "m"))
 
 
-def test_memory_budget():
+def test_memory_budget(monkeypatch):
     capture = Capture(**fields())
-    grid = VolumeGrid((-0.2, 0.1, 0.3), (0.1, 0.2, 0.01), (40, 4, 3))
+    grid = VolumeGrid((-0.2, 0.1, 0.3), (0.1, 0.2, 1e-5), (400_000, 4, 3))
     phasor = imaging(grid)
     full = phasor.plan(capture, 1 << 40)
-    assert (full.method, full.precision, full.field_bytes) == ("lattice", torch.float32, 40 * 12 * 2 * full.rank * 4)
+    voxels = 400_000 * 12
+    assert (full.method, full.precision, full.field_bytes) == ("lattice", torch.float32, voxels * 2 * full.rank * 4)
     assert str(full).startswith(f"phasor basis by FFT convolution: {full.n_frequencies} frequencies in {full.rank} dimensions")
     half = phasor.plan(capture, full.total_bytes - 1)
-    assert (half.precision, half.field_bytes * 2) == (torch.float16, full.field_bytes)
-    with pytest.raises(
-        MemoryBudgetError, match=r"\(40, 4, 3\) voxels × \d+ needs .* GiB even in half precision, the budget is .* GiB"
-    ):
+    assert (half.precision, half.on_disk, half.field_bytes * 2) == (torch.float16, False, full.field_bytes)
+    streamed = phasor.plan(capture, half.total_bytes - 1)
+    assert (streamed.precision, streamed.on_disk, streamed.field_bytes) == (torch.float32, True, full.field_bytes)
+    assert streamed.total_bytes < half.total_bytes
+    assert "GiB float32 on disk +" in str(streamed)
+    sentence = r"\(400000, 4, 3\) voxels × \d+ needs .* GiB of memory and .* GiB of temporary disk .* the budget is .* GiB"
+    with pytest.raises(MemoryBudgetError, match=sentence):
+        phasor.plan(capture, streamed.total_bytes - 1)
+    monkeypatch.setattr("nlos_lit.phasor._free_disk", lambda: full.field_bytes - 1)
+    with pytest.raises(MemoryBudgetError, match=sentence):
         phasor.plan(capture, half.total_bytes - 1)
 
 
