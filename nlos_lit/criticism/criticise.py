@@ -144,7 +144,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
 
     def trial(candidate: Candidate, again: SurfelFit) -> Trial:
         likelihood = log_likelihood(again, split.select)
-        return Trial(candidate, again, compare(reference, likelihood, block), likelihood)
+        return Trial(candidate, again, compare(reference, likelihood, block), likelihood, candidate.gain * len(split.fit) / tested)
 
     trials = []
     for candidate in rivals:
@@ -153,7 +153,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
             "refit", f"refitting with {name}", f"turn{number}_refit_{name}", partial(refit_with, fit, [candidate], s.steps, seed)
         )
         trials.append(trial(candidate, again))
-    trials.sort(key=lambda t: -t.gain.nats)
+    trials.sort(key=lambda t: -t.evidence)
     finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is wanted[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
@@ -168,11 +168,11 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         if again is not None:
             trials.append(trial(candidate, again))
     trials = best_of_each(trials)
-    if not trials:
-        return Turn(candidates, rest, [], None, [], controls)
-    best = choose(trials, block)
-    if best.gain.interval[0] <= 0 or best.gain.nats < needed(best.candidate, s, over) * len(split.select) / tested:
+    share = len(split.select) / tested
+    held = [t for t in trials if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over))]
+    if not held:
         return Turn(candidates, rest, trials, None, [], controls)
+    best = choose(held, block)
     return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar), controls)
 
 
