@@ -20,9 +20,9 @@ from workload import Training, Workload, synthetic_capture
 
 BASE = Workload("base", (64, 64), 512, 1 / 64, 0.005, 0.6, 64, 0.00625, lateral=(64, 64), batch=16, rays=100)
 AXES = {
-    "spots": [(n * n, replace(BASE, spots=(n, n), pitch=1 / n, lateral=None)) for n in (32, 64, 128, 256)],
-    "bins": [(n, replace(BASE, bins=n, bin_length=2.56 / n)) for n in (128, 256, 512, 1024, 2048)],
-    "voxels": [(64 * 64 * n, replace(BASE, planes=n, plane_pitch=0.4 / n)) for n in (32, 64, 128, 256, 512)],
+    "spots": [(n * n, replace(BASE, spots=(n, n), pitch=1 / n, lateral=None)) for n in (32, 64, 128)],
+    "bins": [(n, replace(BASE, bins=n, bin_length=2.56 / n)) for n in (128, 256, 512, 1024)],
+    "voxels": [(64 * 64 * n, replace(BASE, planes=n, plane_pitch=0.4 / n)) for n in (32, 64, 128, 256)],
 }
 
 
