@@ -59,7 +59,7 @@ class Projector:
 
     def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
         x = problem.nuisance
-        gram = (x.T @ x).double()
+        gram = half_products(x).double()
         diagonal = gram.diagonal().clone().clamp_min(float(gram.diagonal().mean()) * 1e-6)
         failed = 1
         while failed:  # single-precision products of nearly dependent columns may need more
@@ -75,6 +75,16 @@ class Projector:
     def weights(self, columns: Tensor) -> Tensor:
         """``[P, k]`` coefficients of the nuisance that come closest to ``columns``."""
         return torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
+
+
+def half_products(x: Tensor, block: int = 512) -> Tensor:
+    """``xᵀx`` ``[P, P]`` with little more than half of its multiplications, which are most of a screening's work."""
+    gram = x.new_empty(x.shape[1], x.shape[1])
+    for start in range(0, x.shape[1], block):
+        part = x[:, start:].T @ x[:, start : start + block]
+        gram[start:, start : start + block] = part
+        gram[start : start + block, start:] = part.T
+    return gram
 
 
 def screen(problem: Problem, projector: Projector, effects: list[Effect], folds: Tensor) -> list[Candidate]:

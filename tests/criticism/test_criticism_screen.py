@@ -13,7 +13,7 @@ from scipy import stats
 from torch import Tensor
 
 from nlos_lit.criticism import screen as screening
-from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
+from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, half_products, screen
 from nlos_lit.criticism.sensitivity import Problem
 from nlos_lit.effects import Effect, Scan
 
@@ -80,6 +80,12 @@ def test_a_prior_leaves_part_of_the_column():
     x = torch.full((ROWS, 1), 0.1)
     left = Projector(problem(torch.zeros(ROWS), x, torch.tensor([3.0]))).off(x)
     assert float(left[0]) == pytest.approx(0.1 * 3 / (ROWS * 0.01 + 3), rel=1e-4)
+
+
+@pytest.mark.parametrize("columns", [1, 4, 6, 7])
+def test_half_of_the_products_are_all(columns):
+    x = normal(ROWS, columns, seed=21)
+    assert torch.allclose(half_products(x, block=3), x.T @ x, rtol=1e-5, atol=1e-4)
 
 
 def test_dependent_columns_do_not_break_the_projection():
