@@ -2,8 +2,8 @@
 
 A dense march of the paper's batch (32 spots × 40 000 rays × several hundred samples) interpolates some 10⁹ samples for 10⁵ hits.
 Here the few bricks that hold a voxel above the threshold are projected into every spot's ray grid, the rays of that neighbourhood
-are clipped against the brick, and only those chords are sampled. The result is exactly that of the dense march, because a sample
-above the threshold has a corner voxel above it and therefore lies in an occupied brick.
+are clipped against the brick, and only those chords are sampled, unless a brighter sample is known already. The result is that of
+the dense march: a sample has a corner voxel no lower than itself, so it lies in a brick with a maximum no lower.
 """
 
 from __future__ import annotations
@@ -132,20 +132,18 @@ def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]
 
     A cell lies between neighbouring voxel centres; brick ``b`` holds cells ``b·size … (b+1)·size - 1``.
     """
-    return torch.nonzero(brick_mask(volume, threshold, size)[0, 0])
+    return torch.nonzero(brick_maximum(volume, size)[0, 0] >= threshold)
 
 
-def brick_mask(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
-    """``[1, 1, bz, bx, by]`` float, 1 where a brick of :func:`occupied_bricks` is occupied."""
-    mask = (volume >= threshold).to(torch.float32)[None, None]
+def brick_maximum(volume: Tensor, size: tuple[int, int, int]) -> Tensor:
+    """``[1, 1, bz, bx, by]`` largest corner voxel of each brick of :func:`occupied_bricks`."""
     nz, nx, ny = volume.shape
     cells = [max(n - 1, 1) for n in (nz, nx, ny)]
     bricks = [-(-n // s) for n, s in zip(cells, size, strict=True)]
     pad = [b * s + 1 - n for b, s, n in zip(bricks, size, (nz, nx, ny), strict=True)]
-    mask = torch.nn.functional.pad(mask, (0, pad[2], 0, pad[1], 0, pad[0]))
+    padded = torch.nn.functional.pad(volume[None, None], (0, pad[2], 0, pad[1], 0, pad[0]), value=-torch.inf)
     # A brick spans size + 1 voxels in each direction, sharing its faces' voxels with its neighbours.
-    kernel = [s + 1 for s in size]
-    return torch.nn.functional.max_pool3d(mask, kernel, stride=size)
+    return torch.nn.functional.max_pool3d(padded, [s + 1 for s in size], stride=size)
 
 
 @torch.no_grad()
@@ -179,11 +177,15 @@ def march(
     """
     n = round(rays.shape[0] ** 0.5)
     device = volume.device
-    pitch = lattice.pitch.tolist()
     # Bricks about as deep as wide, four lateral cells across: small enough to skip, large enough to be few.
-    deep = max(1, round(4 * abs(pitch[0] / pitch[2])))
+    deep = max(1, round(4 * abs(float(lattice.pitch[0] / lattice.pitch[2]))))
     size = (deep, 4, 4)
-    bricks = occupied_bricks(volume, threshold, size)
+    highest = brick_maximum(volume, size)[0, 0]
+    bricks = torch.nonzero(highest >= threshold)
+    highest = highest[tuple(bricks.T)]
+    # The brightest first: many of the others then cannot hold any ray's maximum. Rounding of samples: 1e-6.
+    order = torch.argsort(highest, descending=True, stable=True)
+    bricks, highest = bricks[order], highest[order] * (1 + 1e-6) + (reach if fine == 1 else 0.0)
     edge = torch.tensor([size[1], size[2], size[0]], device=device)
     last = torch.tensor([lattice.shape[1], lattice.shape[2], lattice.shape[0]], device=device) - 1
     extent = edge * lattice.pitch
@@ -196,11 +198,13 @@ def march(
     # Boxes as seen from each wall point: every pair of ray and brick is clipped with two look-ups.
     boxes = torch.cat([start - origins[:, None], end - origins[:, None]], dim=2).reshape(-1, 6)
     scale, shift = unit_scale(lattice)
-    turned = [1, 0, 2]
-    unit_origin, unit_world = ((origins - lattice.origin) * scale + shift)[:, turned], (world * scale)[:, turned]
+    unit_origin = ((origins - lattice.origin) * scale + shift)[:, [1, 0, 2]]
+    unit_world = (world * scale)[:, [1, 0, 2]]
     peak = torch.zeros(origins.shape[0] * n * n, device=device)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for pair, line in _candidates(cells, extent, lattice.origin, origins, frames, n, chunk):
+        promising = torch.nonzero(highest.index_select(0, pair % len(bricks)) >= peak.index_select(0, line)).squeeze(1)
+        pair, line = pair.index_select(0, promising), line.index_select(0, promising)
         near, far = _clip(boxes.index_select(0, pair), inverse.index_select(0, line))
         first = torch.ceil(near / step - 0.5).clamp_min_(0)
         count = (torch.ceil(far / step - 0.5) - first).clamp_min_(0)

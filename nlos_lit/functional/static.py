@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
-from nlos_lit.functional.march import Lattice, brick_mask, constants, sample_unit, unit_scale
+from nlos_lit.functional.march import Lattice, brick_maximum, constants, sample_unit, unit_scale
 
 BLOCK = 16  # neighbouring samples of a ray that are taken or left together
 
@@ -79,7 +79,7 @@ def static_march(
     half = BLOCK * step / 2
     size = tuple(max(1, round(half / abs(p))) for p in (pitch[2], pitch[0], pitch[1]))
     reach = [math.ceil(half / (s * abs(p)) + 1e-3) for s, p in zip(size, (pitch[2], pitch[0], pitch[1]), strict=True)]
-    bricks = brick_mask(volume, threshold, size)
+    bricks = (brick_maximum(volume, size) >= threshold).to(torch.float32)
     near_bricks = max_pool3d(bricks, [2 * r + 1 for r in reach], stride=1, padding=reach)[0, 0]
 
     begin = torch.arange(blocks, device=volume.device) * BLOCK
