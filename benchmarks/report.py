@@ -66,7 +66,7 @@ def growth_figure(name: str, series: dict[str, tuple[Sequence[float], dict[str, 
         for curve, y in curves.items():
             panel.loglog(x, y, "o-", label=f"{curve}, slope {slope(x, y):.2f}")
         panel.set_xlabel(quantity)
-        panel.set_xticks(list(x), [f"{v:g}" for v in x])
+        panel.set_xticks(list(x), [f"{v / 1000:.0f} k" if v > 9999 else f"{v:g}" for v in x])
         panel.minorticks_off()
         panel.grid(alpha=0.3)
         panel.legend(fontsize=7)

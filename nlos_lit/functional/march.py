@@ -43,8 +43,7 @@ def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     """
     nz, nx, ny = lattice.shape
     size = constants((nx, ny, nz), points)
-    position = (points - lattice.origin) / lattice.pitch
-    position = torch.minimum(position.clamp_min(0), size - 1)
+    position = torch.minimum(((points - lattice.origin) / lattice.pitch).clamp_min(0), size - 1)
     low = torch.minimum(position.detach().floor(), (size - 2).clamp_min(0))
     part = position - low
     low = low.long()
