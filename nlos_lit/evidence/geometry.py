@@ -17,6 +17,7 @@ from nlos_lit.evidence.workspace import Arrays, Scene, Subject, Workspace
 from nlos_lit.export import Points
 
 TOLERANCE = 0.02  # m
+HIDDEN = ("95 % surface→truth (mm)", "95 % truth→surface (mm)", "depth error, 95 % (mm)", "coverage", "off the truth")
 SHOWN = 4000  # points of a cloud that are drawn
 BOTH = "RMSE, mean of both ways (mm)"
 
@@ -36,10 +37,10 @@ def figure10(work: Workspace, size: Size) -> Evidence:
         scene = work.open(subject)
         runs = trainings(work, size, subject)
         found = {name: _compared(work, size, subject, scene, name, runs) for name in (*CLASSICAL, *OURS) if _can(name, scene)}
-        rows += [{"capture": subject.label, "system": name, **_row(entry)} for name, entry in found.items()]
+        rows += [{"capture": subject.short, "system": name, **_row(entry)} for name, entry in found.items()]
         clouds.append([_cloud(found.get(name)) for name in (*CLASSICAL, *OURS)])
         labels.append(subject.name)
-        by_name = {row["system"]: row for row in rows if row["capture"] == subject.label}
+        by_name = {row["system"]: row for row in rows if row["capture"] == subject.short}
         for what in (BOTH, "normal error, median (°)"):
             value = {name: row[what] for name, row in by_name.items()}
             glance.append(_glance(what, subject, value))
@@ -59,6 +60,7 @@ def figure10(work: Workspace, size: Size) -> Evidence:
         {"distances": "True points that the wall sees, coloured by their distance to each system's mesh; –: no mesh, or the method "
          "needs a confocal scan."},
         glance,
+        HIDDEN,
     )  # fmt: skip
 
 
@@ -104,4 +106,4 @@ def _cloud(entry: Arrays | None) -> tuple[np.ndarray, np.ndarray] | None:
 
 def _glance(what: str, subject: Subject, value: dict[str, float]) -> Glance:
     classical = {name: v for name, v in value.items() if name in CLASSICAL}
-    return Glance(what, subject.label, value["published system"], classical, value["ours, phasor surface"], value["ours, refined"])
+    return Glance(what, subject.short, value["published system"], classical, value["ours, phasor surface"], value["ours, refined"])

@@ -39,8 +39,9 @@ def update_page(page: Path, results: Path) -> list[str]:
     for name, record in stored.items():
         text = replace_part(text, name, section(name, record))
         copy_files(results / name, page.parent, record)
-    if set(stored) == set(EXPERIMENTS):
-        text = replace_part(text, GLANCE, glance(stored))
+    for name in ORDER:
+        text = text.replace(f"{begin(name)}\n{END}", f"{begin(name)}\nNot measured yet: `python results.py {name}`.\n{END}")
+    text = replace_part(text, GLANCE, glance(stored))
     page.write_text(text, encoding="utf-8")
     return list(stored)
 
@@ -68,9 +69,10 @@ def section(name: str, record: dict[str, Any]) -> str:
 
 
 def glance(records: dict[str, dict[str, Any]]) -> str:
-    """Every comparison of every experiment in one table."""
-    rows = [{"from": name, **row} for name in ORDER for row in records[name]["glance"]]
-    return markdown(rows)
+    """Every comparison of every experiment in one table, and which experiments are not in it."""
+    rows = [{"from": name, **row} for name, record in records.items() for row in record["glance"]]
+    missing = [name for name in EXPERIMENTS if name not in records]
+    return markdown(rows) + (f"\n\nNot measured yet: {', '.join(missing)}." if missing else "")
 
 
 def copy_files(folder: Path, docs: Path, record: dict[str, Any]) -> None:

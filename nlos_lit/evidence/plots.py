@@ -100,7 +100,7 @@ def images(
     side: float = 1.75,
 ) -> Figure:
     """Front views from the wall (+x to the left) in rows and columns; ``extent`` (x0, x1, y0, y1) in m of each row."""
-    figure = Figure(figsize=(0.6 + side * len(columns), 0.5 + (side + 0.12) * len(rows)))
+    figure = Figure(figsize=(1.2 + (side + 0.1) * len(columns), 0.4 + side * len(rows)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False)
     for i, row in enumerate(grid):
         shown = {}

@@ -30,14 +30,14 @@ def profiles(work: Workspace, size: Size) -> Evidence:
         ours = ours or work.train(subject.name, subject, "refine=true")
         runs = _runs(work, size, subject, ours, measured)
         for name, (folder, refined) in runs.items():
-            rows.append({"capture": subject.label, "profile": name, **_scores(summary(folder), refined)})
+            rows.append({"capture": subject.short, "profile": name, **_scores(summary(folder), refined)})
         maps.append([_depth(folder, refined, scene) for name, (folder, refined) in runs.items() if not name.startswith("effects")])
         labels.append(subject.label.split(",")[0])
         ends.append(scene.extent)
-        of = {row["profile"]: row for row in rows if row["capture"] == subject.label}
+        of = {row["profile"]: row for row in rows if row["capture"] == subject.short}
         for what in ("held-out NMSE", "deviance over noise"):
             glance.append(
-                Glance(f"{what}, held-out transients", subject.label, min(of[n][what] for n in ("paper", "reference_code")), {},
+                Glance(f"{what}, held-out transients", subject.short, min(of[n][what] for n in ("paper", "reference_code")), {},
                        of["default"][what], of["default, refined"][what])
             )  # fmt: skip
     names = ["paper", "reference_code", "default", "default, refined"]

@@ -89,6 +89,7 @@ class Evidence:
         figures: name → figure.
         captions: name → caption, one for each figure.
         glance: the comparisons.
+        hidden: columns that only the CSV holds.
     """
 
     name: str
@@ -99,17 +100,19 @@ class Evidence:
     figures: dict[str, Figure]
     captions: dict[str, str]
     glance: list[Glance] = field(default_factory=list)
+    hidden: tuple[str, ...] = ()
 
     def write(self, folder: Path) -> None:
         """``table.csv``, ``table.md``, a PNG a figure, and ``evidence.json`` with everything that is text."""
         folder.mkdir(parents=True, exist_ok=True)
         write_csv(folder / "table.csv", self.rows)
-        (folder / "table.md").write_text(markdown(self.rows) + "\n", encoding="utf-8")
+        shown = [{key: value for key, value in row.items() if key not in self.hidden} for row in self.rows]
+        (folder / "table.md").write_text(markdown(shown) + "\n", encoding="utf-8")
         for name, figure in self.figures.items():
             save_figure(figure, folder / f"{name}.png")
-        texts = {key: getattr(self, key) for key in ("name", "title", "paper", "here", "rows", "captions")}
+        texts = {key: getattr(self, key) for key in ("name", "title", "paper", "here", "captions")}
         comparisons = [entry.row() for entry in self.glance]
-        write_json(folder / "evidence.json", {**texts, "glance": comparisons, "git": git_state()})
+        write_json(folder / "evidence.json", {**texts, "rows": shown, "glance": comparisons, "git": git_state()})
 
 
 def read_record(folder: Path) -> dict[str, Any]:

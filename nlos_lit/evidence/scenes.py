@@ -27,7 +27,7 @@ def figure9(work: Workspace, size: Size) -> Evidence:
         held, refined = found["heldout"], found["refined"]
         value = {name: entry["value"] for name, entry in found["parameters"].items()}
         rows.append({
-            "capture": subject.label,
+            "capture": subject.short,
             "NMSE before": held["nmse"]["initial"],
             "NMSE after": held["nmse"]["final"],
             "NMSE refined": refined["heldout"]["nmse"],

@@ -89,7 +89,7 @@ def figure5(work: Workspace, size: Size) -> Evidence:
         for name, values in track.items():
             refined = found["refined"]["parameters"].get(REFINED_NAMES.get(name, name))
             rows.append({
-                "capture": subject.label, "parameter": name, "unit": units[name], "after 1": values[0], "final": values[-1],
+                "capture": subject.short, "parameter": name, "unit": units[name], "after 1": values[0], "final": values[-1],
                 "truth": truth.get(name), f"within {100 * SETTLED:.0f} % from iteration": settled_at(values),
                 "refined": refined and refined["value"],
             })  # fmt: skip
@@ -115,9 +115,9 @@ def _truth(scene: Scene) -> dict[str, float]:
 
 
 def _response_glance(rows: list[Row], subject: Subject) -> Glance:
-    row = next(r for r in rows if r["capture"] == subject.label and r["parameter"] == "sigma_ls")
+    row = next(r for r in rows if r["capture"] == subject.short and r["parameter"] == "sigma_ls")
     error = [abs(row[name] / row["truth"] - 1) for name in ("final", "refined")]
-    return Glance("relative error of σ_ls", subject.label, None, {}, *error)
+    return Glance("relative error of σ_ls", subject.short, None, {}, *error)
 
 
 def _state(folder: Path, when: str) -> dict[str, Any]:

@@ -41,6 +41,11 @@ class Subject:
     label: str
     overrides: tuple[str, ...]
 
+    @property
+    def short(self) -> str:
+        """The label up to the number of spots."""
+        return self.label.split(" spots")[0]
+
 
 @dataclass(frozen=True)
 class Scene:
