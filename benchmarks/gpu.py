@@ -60,8 +60,8 @@ def measure(workload: Workload, device: torch.device) -> dict[str, object]:
     """One configuration from its capture to its last iteration."""
     capture = synthetic_capture(workload)
     if device.type == "cuda":
-        torch.cuda.reset_peak_memory_stats(device)
         torch.zeros(1, device=device)  # the driver's own start is not the set-up's
+        torch.cuda.reset_peak_memory_stats(device)
     began = time.perf_counter()
     training = Training(workload, capture, budget=100 * GIB, device=device)
     print(f"{workload.name}: {training.plan}", flush=True)

@@ -94,10 +94,11 @@ def report() -> None:
         nz, nx, ny = r["volume"]
         sizes = f"{r['spots'][0]} × {r['spots'][1]} × {r['bins']} → {nx} × {ny} × {nz}"
         wall = r["total_s"] if own else r["setup_s"] + workload.iterations * r["iteration_s"]
-        core = r["setup_cpu_s"] + workload.iterations * r["iteration_cpu_s"]
+        setup, iteration = r.get("setup_cpu_s", r["setup_s"]), r.get("iteration_cpu_s", r["iteration_s"])
+        core = setup + workload.iterations * iteration
         how = "run to the end" if own and r["complete"] else f"projected from {r['measured_iterations']}"
         rows.append([
-            workload.name, sizes, f"{r['setup_cpu_s']:.0f} s", f"{r['iteration_cpu_s']:.2f} s", str(workload.iterations),
+            workload.name, sizes, f"{setup:.0f} s", f"{iteration:.2f} s", str(workload.iterations),
             f"{core / 60:.1f} min", f"{wall / 60:.1f} min", how if own else f"{how}, as {r['name']}",
             f"{60 * workload.paper_hours:.0f} min", f"{3600 * workload.paper_hours / core:.0f}",
             f"{r['estimate_bytes'] / GIB:.2f} / {r['peak_bytes'] / GIB:.2f} GiB", f"{100 * r['hits']:.1f} %",
