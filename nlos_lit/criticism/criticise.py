@@ -113,7 +113,7 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
     candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
-    return Look(candidates, discrepancies(problem, projector, scan), projector.weights(problem.residual[:, None])[:, 0])
+    return Look(candidates, discrepancies(problem, projector, scan), projector.own)
 
 
 def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps) -> Turn:

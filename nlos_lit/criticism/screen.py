@@ -13,7 +13,7 @@ weighs effects with one and with thirty coefficients on the same scale, and misf
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import torch
 from scipy import stats
@@ -66,15 +66,17 @@ class Projector:
             self.factor, failed = torch.linalg.cholesky_ex(gram + torch.diag(problem.prior.double() + ridge * diagonal))
             ridge *= 10
         self.nuisance = x
-        self.residual = self.off(problem.residual[:, None])[:, 0]
+        residual, own = self.apart(problem.residual[:, None])
+        self.residual, self.own = residual[:, 0], own[:, 0]  # own [P]: the step that the base asks for by itself
 
     def off(self, columns: Tensor) -> Tensor:
         """``columns`` ``[N, k]`` without their projection on the nuisance."""
-        return columns - self.nuisance @ self.weights(columns)
+        return self.apart(columns)[0]
 
-    def weights(self, columns: Tensor) -> Tensor:
-        """``[P, k]`` coefficients of the nuisance that come closest to ``columns``."""
-        return torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
+    def apart(self, columns: Tensor) -> tuple[Tensor, Tensor]:
+        """:meth:`off`, and the coefficients ``[P, k]`` of the nuisance that were taken off."""
+        weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
+        return columns - self.nuisance @ weights, weights
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
@@ -106,7 +108,7 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
     prior = effect.precision()[: len(lower)].double()
     scales = PRIOR_SCALES if bool(prior.any()) else (1.0,)
     best: Candidate | None = None
-    for shape, raw, z in _projected(problem, projector, effect, shapes):
+    for shape, raw, z, weights in _projected(problem, projector, effect, shapes):
         k = z.shape[1]
         by_spot = z.view(spots, bins, k)
         score = torch.einsum("sbk,sb->sk", by_spot, projector.residual.view(spots, bins)).double()
@@ -129,11 +131,10 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
             direction = (z @ step.float()) if float(step.abs().max()) > 0 else z.sum(1)
             direction = direction / direction.norm().clamp_min(1e-30)
             error = torch.linalg.inv(known).diagonal().sqrt()
-            best = Candidate(
-                effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction, raw @ step.float()
-            )
+            beside = projector.own - weights @ step.float()
+            best = Candidate(effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction, beside)
     effect.set_all(best.shape)
-    return replace(best, beside=projector.weights((problem.residual - best.beside)[:, None])[:, 0])
+    return best
 
 
 def _predicted(score: Tensor, information: Tensor, ridge: Tensor, lower: Tensor, upper: Tensor) -> float:
@@ -147,8 +148,8 @@ def _predicted(score: Tensor, information: Tensor, ridge: Tensor, lower: Tensor,
 
 def _projected(
     problem: Problem, projector: Projector, effect: Effect, shapes: list[dict[str, float]]
-) -> Iterator[tuple[dict[str, float], Tensor, Tensor]]:
-    """Shape, its columns, its projected columns, for the shapes most worth it.
+) -> Iterator[tuple[dict[str, float], Tensor, Tensor, Tensor]]:
+    """Shape, its columns, its projected columns, what was taken off them; for the shapes most worth it.
 
     Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what costs. So shapes are
     ranked by the score over the unprojected information first.
@@ -166,8 +167,8 @@ def _projected(
     for _, shape, z in ranked[:KEPT]:
         effect.set_all(shape)
         columns.append(weighted_columns(problem, effect) if z is None else z)
-    projected = projector.off(torch.cat(columns, 1)).split(columns[0].shape[1], dim=1)
-    yield from zip([r[1] for r in ranked[:KEPT]], columns, (p.contiguous() for p in projected), strict=True)
+    projected, weights = (t.split(columns[0].shape[1], dim=1) for t in projector.apart(torch.cat(columns, 1)))
+    yield from zip([r[1] for r in ranked[:KEPT]], columns, (p.contiguous() for p in projected), weights, strict=True)
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:
@@ -184,5 +185,5 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     direction = (column * full[problem.spots, None]).reshape(-1)
     direction = direction / direction.norm().clamp_min(1e-30)
     p = float(stats.chi2.sf(2 * gain, 1 + positive))
-    beside = projector.weights((problem.residual - (column * full[problem.spots, None]).reshape(-1))[:, None])[:, 0]
+    beside = projector.apart((problem.residual - (column * full[problem.spots, None]).reshape(-1))[:, None])[1][:, 0]
     return Candidate(effect, 2 * gain, p, 1.0, gain, full, error, {}, direction, beside)

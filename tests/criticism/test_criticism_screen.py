@@ -73,6 +73,8 @@ def test_projection_is_orthogonal_to_the_nuisance_and_moves_nothing_else():
     mixture = x @ normal(7, 2, seed=5)
     assert float(projector.off(mixture).abs().max()) < 1e-4 * float(mixture.abs().max())
     assert torch.equal(projector.residual, projector.off(normal(ROWS, seed=2)[:, None])[:, 0])
+    own = torch.linalg.lstsq(x, normal(ROWS, seed=2)[:, None]).solution[:, 0]
+    assert torch.allclose(projector.own, own, atol=1e-5)
 
 
 def test_a_prior_leaves_part_of_the_column():
@@ -149,6 +151,8 @@ def test_retained_information_is_what_the_base_leaves():
     z = columns(effect_of("time_offset", SCAN))[:, 0]
     left = z - x @ torch.linalg.lstsq(x, z[:, None]).solution[:, 0]
     assert candidate.retained == pytest.approx(float((left**2).sum() / (z**2).sum()), rel=1e-3)
+    beside = torch.linalg.lstsq(x, (normal(ROWS, seed=8) - z * candidate.step)[:, None]).solution[:, 0]
+    assert torch.allclose(candidate.beside, beside, atol=1e-4)  # what the base does at the same time
     assert 0.4 < candidate.retained < 0.6
 
 
@@ -205,8 +209,8 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     whole = problem(ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
     passes = []
     projector = Projector(whole)
-    off = projector.off
-    monkeypatch.setattr(projector, "off", lambda z: passes.append(z.shape[1]) or off(z))
+    apart = projector.apart
+    monkeypatch.setattr(projector, "apart", lambda z: passes.append(z.shape[1]) or apart(z))
     (candidate,) = screen(whole, projector, [effect_of("tcspc_nonlinearity", SCAN)], FOLD)
     assert passes == [2 * screening.KEPT]
     assert candidate.shape["period"] == period
