@@ -149,4 +149,4 @@ def cell(value: Any) -> str:
         return "✓" if value else "–"
     if isinstance(value, float):
         return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
-    return str(value)
+    return str(value).replace("|", "\\|")

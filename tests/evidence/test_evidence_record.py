@@ -15,6 +15,7 @@ from nlos_lit.figures import loss_plot
     [
         (None, "–"), (float("nan"), "–"), (True, "✓"), (False, "–"), (0.0, "0"), (12.3456, "12.3"), (4.58e-4, "4.58e-04"),
         (7, "7"), ("lct", "lct"), (1234567.0, "1.23e+06"),
+        ("|x|", "\\|x\\|"),
     ],
 )  # fmt: skip
 def test_cells(value, text):
