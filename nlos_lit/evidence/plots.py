@@ -113,6 +113,7 @@ def images(
                 axes.set_ylabel(rows[i], fontsize="small")
             if image is None:
                 axes.text(0.5, 0.5, "–", transform=axes.transAxes, ha="center", va="center")
+                axes.set_box_aspect((extent[i][3] - extent[i][2]) / (extent[i][1] - extent[i][0]))
                 continue
             drawn = axes.imshow(np.swapaxes(image.values, 0, 1), extent=extent[i], origin="lower", aspect="equal", **_scale(image))
             axes.invert_xaxis()
