@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 
 import torch
+from scipy.optimize import minimize_scalar
 from torch import Tensor
 
 from nlos_lit.criticism.sensitivity import effect_columns
@@ -49,7 +50,15 @@ def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[floa
             width = typical * 2.0**k
             gain = float(factors(score, information, width, share, positive).sum())
             best = max(best, (gain, width, share))
-    return best
+    if best[0] == 0.0:
+        return best
+
+    def loss(octaves: float) -> float:
+        return -float(factors(score, information, 2.0**octaves, best[2], positive).sum())
+
+    middle = math.log2(best[1])
+    found = minimize_scalar(loss, bounds=(middle - 0.5, middle + 0.5), method="bounded", options={"xatol": 1e-3})
+    return max(best, (-float(found.fun), 2.0 ** float(found.x), best[2]))
 
 
 def coefficients(score: Tensor, information: Tensor, width: float, positive: bool) -> Tensor:

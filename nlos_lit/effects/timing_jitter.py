@@ -15,7 +15,8 @@ class TimingJitter(Effect):
 
     ``L → L + δ_s``, ``δ_s ~ N(0, σ²)``, independent
 
-    Parameters: ``offset`` δ (m of path), one for each spot, null 0. Quantity ``sigma`` (m), their root mean square.
+    Parameters: ``offset`` δ (m of path), one for each spot, null 0. Quantity ``sigma`` (m): the width of their
+    distribution where it was fitted, else the root mean square of those that are not exactly 0.
 
     Signature: residuals of both signs at edges in time, all of one spot with the same sign, neighbouring spots unrelated.
 
@@ -38,5 +39,8 @@ class TimingJitter(Effect):
         return length + self.value("offset").reshape(-1)[spots][:, None, None]
 
     def quantities(self) -> dict[str, Quantity]:
-        root = euclidean(self.value("offset") / self.scan.n_spots**0.5, self.declared["offset"].scale)
-        return {"sigma": Quantity(root, "m")}
+        offset, scale = self.value("offset").reshape(-1), self.declared["offset"].scale
+        if self.width:
+            return {"sigma": Quantity(offset.new_tensor(self.width * scale), "m")}
+        spots = (offset != 0).sum().clamp_min(1)  # those of other spots stay at 0
+        return {"sigma": Quantity(euclidean(offset / spots**0.5, scale), "m")}

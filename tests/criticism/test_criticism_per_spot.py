@@ -44,7 +44,7 @@ def test_factors_are_the_integral_over_the_coefficient(positive):
 def test_width_of_a_normal_scatter():
     for width in (0.3, 1.0, 4.0):
         gain, found, share = best_width(*scores(width * np.random.default_rng(1).standard_normal(800), seed=2), False)
-        assert found == pytest.approx(width, rel=0.25)
+        assert found == pytest.approx(width, rel=0.12)  # its own scatter is 1/√1600 … 10 % (where it is below the noise)
         assert share == 1.0
         assert gain > 10
 

@@ -105,7 +105,9 @@ def test_offsets_of_time():
     jitter = effect("timing_jitter", offset=torch.tensor([0.03, -0.04] + [0.0] * (SPOTS - 2)))
     assert jitter.time(lengths, paths, torch.tensor([1])).item() == pytest.approx(1.48, abs=1e-6)
     sigma = jitter.quantities()["sigma"].value.item()
-    assert sigma == pytest.approx(0.05 / math.sqrt(SPOTS), abs=1e-5)
+    assert sigma == pytest.approx(0.05 / math.sqrt(2), abs=1e-5)  # spots at exactly 0 were not solved for
+    jitter.width = 3.0  # in bins
+    assert jitter.quantities()["sigma"].value.item() == pytest.approx(3.0 * jitter.scan.bin_length)
 
 
 def test_time_drift_follows_the_order_of_acquisition():
