@@ -105,8 +105,8 @@ def line(name: str, case: dict) -> str:
 
 
 def tables(store: Path) -> str:
-    """All tables as Markdown."""
-    named = {f.stem: json.loads(f.read_text()) for f in sorted(store.glob("[0-9]*.json"))}
+    """All tables as Markdown, of the outcomes of ``blind.py table``."""
+    named = {f.stem: json.loads(f.read_text()) for f in sorted(store.glob("[npsu]*_[0-9]*.json"))}
     cases = list(named.values())
     out = [f"{len(cases)} captures, {sum(c['seconds'] for c in cases) / 3600:.1f} hours of one core.", ""]
     out += ["| what | required | measured (95 % interval) |", "|---|---|---|"]
