@@ -18,8 +18,10 @@ from contextlib import contextmanager
 
 import torch
 from report import store, stored, table
-from timing import copy_bandwidth, machine, median, peak_bytes
+from timing import copy_bandwidth, machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
+
+from nlos_lit.memory import peak_bytes
 
 GIB = 2**30
 BETWEEN = 10  # iterations between looks at the capacity, as in training with logging

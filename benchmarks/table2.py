@@ -21,8 +21,10 @@ import time
 
 import torch
 from report import store, stored, table, write_section
-from timing import machine, median, peak_bytes
+from timing import machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
+
+from nlos_lit.memory import peak_bytes
 
 SAME = {"Erato": "Dragon", "Indonesian": "Dragon", "NLOS": "44i"}
 LEAST = 12  # iterations measured where the total is projected

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import resource
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -22,12 +20,6 @@ def seconds(work: Callable[[], Any]) -> float:
 
 def median(values: list[float]) -> float:
     return sorted(values)[len(values) // 2]
-
-
-def peak_bytes() -> int:
-    """Largest resident memory of this process so far."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def copy_bandwidth(device: torch.device | str = "cpu", size: int = 1 << 28) -> float:

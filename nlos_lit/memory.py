@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+import resource
+import sys
+from pathlib import Path
 
 from nlos_lit.errors import MemoryBudgetError, UserError
 from nlos_lit.phasor import PhasorPlan
@@ -58,3 +61,15 @@ def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     iterating = 72 * n_voxels + 120 * rays
     matching = 24 * n_voxels + 180 * rays
     return max(plan.total_bytes, plan.resident_bytes + max(iterating, matching) + _SCRATCH)
+
+
+def peak_bytes() -> int:
+    """Largest resident memory of this process so far.
+
+    Linux keeps it for each program; getrusage(2), which is asked elsewhere, starts with that of the program that started this one.
+    """
+    status = Path("/proc/self/status")
+    if status.exists():
+        return 1024 * int(next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:")).split()[1])
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit

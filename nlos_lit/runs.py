@@ -74,7 +74,7 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
     settings = pipeline_settings(config["model"])
     pipeline = build_pipeline(capture, grid, settings).to(device)
     plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]))
-    rays = settings.rays ** 2 * config["batch_spots"]
+    rays = settings.rays**2 * config["batch_spots"]
     planned = run_bytes(plan, grid.n_voxels, rays) + LATER_LIBRARIES
     check_machine(planned, "this run")
     estimated = planned + resident_bytes()

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import platform
-import resource
 import subprocess
-import sys
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 import torch
 
 import nlos_lit
+from nlos_lit.memory import peak_bytes
 
 PACKAGES = ("torch", "lightning", "numpy", "open3d", "hydra-core", "omegaconf", "h5py", "scipy", "matplotlib")
 ROOT = Path(__file__).resolve().parents[1]
@@ -54,7 +53,7 @@ def build_summary(
         "parameters": {name: {"value": value, "unit": unit} for name, (value, unit) in parameters.items()},
         "geometry": None if geometry is None else dict(geometry),
         "seconds": dict(zip(("setup", "per_iteration", "total"), seconds, strict=True)),
-        "peak_memory_bytes": peak_memory_bytes(),
+        "peak_memory_bytes": peak_bytes(),
         "peak_gpu_memory_bytes": peak_gpu_memory_bytes(),
         "versions": versions(),
         "git": git_state(),
@@ -90,12 +89,6 @@ def _git(root: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
-
-
-def peak_memory_bytes() -> int:
-    """Largest resident memory this process has had so far."""
-    unit = 1 if sys.platform == "darwin" else 1024  # getrusage(2): bytes on macOS, KiB on Linux
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def peak_gpu_memory_bytes() -> int | None:
