@@ -18,9 +18,9 @@ from nlos_lit.baselines.surface import front_points
 from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
 from nlos_lit.export import write_json, write_points, write_volume
 from nlos_lit.geometry_metrics import geometry_errors
-from nlos_lit.memory import check_machine, parse_bytes
+from nlos_lit.memory import check_machine, parse_bytes, peak_bytes
 from nlos_lit.scan import volume_grid
-from nlos_lit.summary import git_state, peak_memory_bytes, versions
+from nlos_lit.summary import git_state, versions
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ def main(config: DictConfig) -> None:
         "method": method,
         "geometry": None,
         "seconds": {"setup": setup, "method": seconds, "total": time.perf_counter() - began},
-        "peak_memory_bytes": peak_memory_bytes(),
+        "peak_memory_bytes": peak_bytes(),
         "estimated_memory_bytes": needed,
         "versions": versions(),
         "git": git_state(),
