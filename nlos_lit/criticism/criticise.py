@@ -12,6 +12,7 @@ import torch
 
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
 from nlos_lit.criticism.joint_step import copy_effects
+from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.rivals import Trial, best_of_each, choose, group_of
 from nlos_lit.criticism.screen import FOLDS, Candidate, Projector, screen
@@ -268,31 +269,5 @@ def criticise(
             last = steps("screen", "screening what is left", "last_screen", partial(look, fit, split, scan, s, seed))
             turns.append(Turn(last.candidates, last.discrepancies, [], None, []))
             break
-    fit = drop_needless(fit, split, s, seed, steps)
+    fit = drop_needless(fit, split, s.steps, seed, steps)
     return Findings(base, fit, turns)
-
-
-def drop_needless(fit: SurfelFit, split: Split, s: CriticismSettings, seed: int, steps: Steps) -> SurfelFit:
-    """Backward: an effect accepted early may be explained by those that came later."""
-    block = split.block[split.select]
-    while len(fit.extension.effects) > 1:
-        names = [e.name for e in fit.extension.effects]
-        steps.plan(refit=len(names) + 1)
-        key = f"drop{len(names)}"
-        whole = steps("refit", "refitting with all effects", key, partial(refit_with, fit, [], s.steps, seed))
-        reference, losses = log_likelihood(whole, split.select), []
-        for name in names:
-            fewer = steps("refit", f"refitting without {name}", f"{key}_{name}", partial(_without, fit, name, s.steps, seed))
-            losses.append((compare(log_likelihood(fewer, split.select), reference, block), fewer))
-        least, fewer = min(losses, key=lambda entry: entry[0].nats)
-        if least.nats > 2 * least.error:
-            break
-        fit = fewer
-    return fit
-
-
-def _without(fit: SurfelFit, name: str, steps: int, seed: int) -> SurfelFit:
-    """Refitted without one of its effects."""
-    fewer = fit.copy(Extension([e for e in copy_effects(fit.extension, []).effects if e.name != name]), seed)
-    fewer.run(1, steps=steps, settle=False)
-    return fewer

@@ -55,13 +55,12 @@ def _add(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
 
 
 def best_start(fit: SurfelFit, extra: list[Effect], steps: list[Tensor], beside: Tensor | None, seed: int) -> SurfelFit:
-    """A copy of the fit with ``extra`` effects, begun where the tested spots are likeliest.
+    """A copy of the fit with ``extra`` effects, begun where the tested spots are likeliest: steps of the effects with the base left
+    alone, or joint steps of several lengths.
 
     Args:
         steps: ``[k]`` of each extra effect's stored amplitudes. beside: ``[P]`` what the base does at the same time, None for
             nothing.
-
-    The effects' steps with the base left alone, or joint steps of several lengths.
     """
 
     def begun(length: float, moved: Tensor | None) -> SurfelFit:

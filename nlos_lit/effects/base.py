@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
@@ -112,10 +111,7 @@ class Effect(nn.Module, Hooks):
 
     def precision(self) -> Tensor:
         """Prior precision of all stored values (amplitudes in order, then shapes): [k], 0 where there is no prior."""
-        parts = []
-        for p in self.declared.values():
-            deviation = torch.tensor(p.prior or (math.inf,) * p.size) * (self.prior_scale / p.scale)
-            parts.append(deviation.square().reciprocal())
+        parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]
         return torch.cat(parts) if parts else torch.zeros(0)
 
     def penalty(self) -> Tensor:
@@ -124,9 +120,13 @@ class Effect(nn.Module, Hooks):
         for p in self.declared.values():
             if p.prior:
                 raw = getattr(self, f"raw_{p.name}")
-                deviation = torch.tensor(p.prior, device=raw.device) * (self.prior_scale / p.scale)
-                total = total.to(raw.device) + 0.5 * ((raw - (p.null or 0.0) / p.scale) / deviation).square().sum()
+                off = raw - (p.null or 0.0) / p.scale
+                total = total.to(raw.device) + 0.5 * (self._precision(p).to(raw.device) * off.square()).sum()
         return total
+
+    def _precision(self, p: Parameter) -> Tensor:
+        """[size] of stored values of a parameter that has a prior."""
+        return (torch.tensor(p.prior) * (self.prior_scale / p.scale)).square().reciprocal()
 
     @property
     def amplitudes(self) -> list[Parameter]:

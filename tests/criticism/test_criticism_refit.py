@@ -15,6 +15,7 @@ from scipy.special import gammaln
 from torch import Tensor
 
 from nlos_lit.criticism import criticise as loop
+from nlos_lit.criticism import needless
 from nlos_lit.criticism.criticise import (
     CriticismSettings,
     Findings,
@@ -24,13 +25,13 @@ from nlos_lit.criticism.criticise import (
     best_of_each,
     choose,
     criticise,
-    drop_needless,
     group_of,
     needed,
     null_of,
     significant,
 )
 from nlos_lit.criticism.joint_step import set_step
+from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.steps import Steps
@@ -219,19 +220,19 @@ SPLIT = SimpleNamespace(select=np.arange(120), fit=np.arange(300), block=BLOCK)
 
 def with_table(monkeypatch, table: dict[str, float]) -> None:
     """``table``: what each effect is worth, nats a spot, with some scatter."""
-    monkeypatch.setattr(loop, "refit_with", lambda fit, *_: fit)
+    monkeypatch.setattr(needless, "refit_with", lambda fit, *_: fit)
 
     def likelihood(fit: FakeFit, spots: np.ndarray) -> Tensor:
         return per_spot(0, 1) + sum(per_spot(table[n], 0.1) for n in sorted(fit.names))
 
-    monkeypatch.setattr(loop, "log_likelihood", likelihood)
+    monkeypatch.setattr(needless, "log_likelihood", likelihood)
 
 
 def test_needless_effects_are_dropped(monkeypatch):
     with_table(monkeypatch, {"irf_tail": 2.0, "afterpulsing": 0.001, "pile_up": -0.5})
     said = []
     steps = Steps(lambda text, *_: said.append(text))
-    kept = drop_needless(FakeFit(("irf_tail", "afterpulsing", "pile_up")), SPLIT, CriticismSettings(), 0, steps)
+    kept = drop_needless(FakeFit(("irf_tail", "afterpulsing", "pile_up")), SPLIT, 60, 0, steps)
     assert kept.names == {"irf_tail"}
     without = [text for text in said if "without" in text]
     assert len(without) == 5  # three, then two; a single effect was compared with none when it was accepted
@@ -240,7 +241,7 @@ def test_needless_effects_are_dropped(monkeypatch):
 def test_needed_effects_stay(monkeypatch):
     with_table(monkeypatch, {"irf_tail": 2.0, "pile_up": 0.3})
     fit = FakeFit(("irf_tail", "pile_up"))
-    assert drop_needless(fit, SPLIT, CriticismSettings(), 0, Steps()) is fit
+    assert drop_needless(fit, SPLIT, 60, 0, Steps()) is fit
 
 
 def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
