@@ -55,7 +55,11 @@ def main(config: DictConfig) -> None:
             Bar(),
             Figures(monitor["figures_every"], shown_spots(run.capture.n_spots, monitor["spots"]), folder / "figures"),
             ModelCheckpoint(
-                folder / "checkpoints", save_last=True, every_n_epochs=monitor["checkpoint_every"], filename="iteration"
+                folder / "checkpoints",
+                filename="iteration",
+                save_last=True,
+                every_n_epochs=monitor["checkpoint_every"],
+                save_on_train_epoch_end=True,  # not only where the held-out spots are scored
             ),
         ],
     )
