@@ -107,6 +107,7 @@ def refine(
         history = _run_scanning_shapes(fit, progress)
     else:
         history = fit.run(settings.rounds, progress)
+    history += fit.converge(progress)
     model = fit.model
     normalise_albedo(model)
     held = torch.as_tensor(np.asarray([] if heldout_spots is None else heldout_spots), dtype=torch.long)

@@ -15,11 +15,13 @@ from nlos_lit.capture import Capture
 from nlos_lit.effects.base import Extension
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
+from nlos_lit.metrics import expected_deviance, poisson_deviance
 from nlos_lit.parameters import BoundedParameter
 from nlos_lit.surfel_seed import Candidates, prune_and_grow
 from nlos_lit.surfels import SurfelModel
 
 Progress = Callable[[int, int], None]
+WORTH = 0.02  # nats a parameter that another round must gain
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class RefineSettings:
         subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else 1.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has twice as many.
+        more: last rounds that may follow, see :meth:`SurfelFit.converge`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
@@ -53,6 +56,7 @@ class RefineSettings:
     quadrature: int | None = None
     rounds: int = 4
     steps: int = 100
+    more: int = 4
     batch: int = 48
     depth_rate: float = 0.15
     albedo_rate: float = 0.08
@@ -98,7 +102,7 @@ class SurfelFit:
     ) -> None:
         self.model, self.capture, self.grid, self.counts, self.train = model, capture, grid, counts, train
         self.settings, self.reserve, self.extension, self.generator = settings, reserve, extension, generator
-        self.order, self.place = order, 0
+        self.order, self.place, self.done = order, 0, 0  # done: batches so far
         self.tested = order[: settings.test_spots]
 
     def copy(self, extension: Extension, seed: int) -> SurfelFit:
@@ -144,13 +148,42 @@ class SurfelFit:
             losses = []
             for loss in self._round(rounds - 1 - index, index == 0 and settle, steps):
                 losses.append(loss)
-                done += 1
+                done, self.done = done + 1, self.done + 1
                 if progress is not None:
                     progress(done, total)
             self.model.link()
             sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
             history.append({"surfels": len(self.model), "loss": float(np.mean(losses[-len(losses) // 4 :])), **sensor})
         return history
+
+    def converge(self, progress: Progress | None = None) -> list[dict[str, float]]:
+        """Last rounds anew, ``more`` at most, while the fit is above the noise and a round gains more than ``WORTH`` a parameter.
+
+        Bright captures take longer to converge; where the fit is at the noise already, more batches would only fit the noise.
+        Returns one entry a round; ``progress`` goes on from the batches that were done before.
+        """
+
+        def told(done: int, total: int) -> None:
+            if progress is not None:
+                progress(self.done, self.done - done + total)
+
+        history: list[dict[str, float]] = []
+        parameters = sum(p.numel() for p in [*self.model.parameters(), *self.extension.parameters()])
+        bins = self.counts.numel()
+        before, noise = self._deviance()
+        while len(history) < self.settings.more and before > noise:
+            history += self.run(1, told, settle=False)
+            after, noise = self._deviance()
+            if (before - after) * bins / 2 < WORTH * parameters:
+                break
+            before = after
+        return history
+
+    @torch.no_grad()
+    def _deviance(self) -> tuple[float, float]:
+        """Per bin of the tested rows, and what noise alone would make."""
+        expected = self.model.expected(self.train[self.tested], self.extension)
+        return float(poisson_deviance(self.counts[self.tested], expected).mean()), float(expected_deviance(expected))
 
     def _round(self, left: int, settling: bool, steps: int) -> Iterator[float]:
         s, model = self.settings, self.model

@@ -17,12 +17,12 @@ from nlos_lit.effects import Extension, Scan, build_effects
 from nlos_lit.effects.shapes import choose_shapes
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
-from nlos_lit.refine import RefineSettings, refine
+from nlos_lit.refine import RefineSettings, refine, score_spots
 from nlos_lit.scan import volume_grid
 from nlos_lit.surfel_seed import Candidates, best_apart, neighbour_candidates, occupied, prune_and_grow
 from nlos_lit.surfels import SurfelModel
 
-QUICK = RefineSettings(rounds=3, steps=60, batch=24, test_spots=200, floor=0.15, per_cell=2, quadrature=2)
+QUICK = RefineSettings(rounds=3, steps=60, more=0, batch=24, test_spots=200, floor=0.15, per_cell=2, quadrature=2)
 BIN = 0.0096
 
 
@@ -115,6 +115,25 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
             assert torch.equal(value, blind.model.state_dict()[name])
     assert blind.heldout.deviance_per_bin > 2 * first.heldout.deviance_per_bin
     assert first.parameters != other.parameters
+
+
+def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
+    capture, held, intensity, grid, _ = fitted
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=1, steps=20)
+    seen, deviances, rounds = [], [], []
+    for more in (0, 1, 6):
+        settings = dataclasses.replace(short, more=more)
+        progress = (lambda *count: seen.append(count)) if more == 1 else None
+        result = refine(capture, intensity, grid, settings, train, progress=progress)
+        deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
+        rounds.append(len(result.history))
+    assert rounds[:2] == [1, 2]
+    assert 3 <= rounds[2] <= 7
+    assert deviances[0] > deviances[1] > deviances[2]
+    assert seen == [(k, 40) for k in range(1, 41)] + [(k, 80) for k in range(41, 81)]
+    own = result.fit.copy(Extension([]), 0)
+    own.counts = own.model.expected(own.train)
+    assert own.converge() == []
 
 
 def test_only_the_given_spots_are_scored(fitted):

@@ -120,6 +120,7 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
 def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
+    Rivals are the wanted effects, and those that promise more but are too like the base to be wanted by themselves.
     The control goes through the same without another effect (as it is, refitted, or rebuilt with another random seed).
 
     Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
@@ -135,7 +136,8 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
     block = split.block[split.select]
-    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
+    promising = [c for c in candidates if c in wanted or (wanted and c.p_value < s.level and c.gain > wanted[0].gain)]
+    rivals = [c for c in promising[: s.rivals] if c.gain > s.hopeless * promising[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
     own = partial(refit_with, fit, [], s.steps, seed, seen.own)
     controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
@@ -155,7 +157,7 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         )
         trials.append(trial(candidate, again))
     trials.sort(key=lambda t: -t.evidence)
-    finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is wanted[0]]
+    finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is promising[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
