@@ -67,9 +67,9 @@ def styled(plot: Callable[..., Figure]) -> Callable[..., Figure]:
 
 
 def save_figure(figure: Figure, path: Path | str) -> None:
-    """PNG, PDF or SVG by the suffix; a whole file or none."""
+    """PNG (2000 pixels wide at most), PDF or SVG by the suffix; a whole file or none."""
     with whole_file(path) as partial:
-        figure.savefig(partial, dpi=150)
+        figure.savefig(partial, dpi=min(150.0, 2000 / figure.get_figwidth()))
 
 
 @styled
