@@ -49,7 +49,7 @@ class CriticismSettings:
         most: effects that are accepted at most.
         explained: share of the structured misfit that named effects must explain; below it, the misfit is called unexplained.
         numerics: vary seed and quadrature of the base, too.
-        toys: simulated captures for the null distribution. processes: that work on them.
+        toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on side by side.
     """
 
     spots: int = 1024
@@ -135,42 +135,37 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     far_off = misfit > s.far_off * noise
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
-    block = split.block[split.select]
     promising = [c for c in candidates if c in wanted or (wanted and c.p_value < s.level and c.gain > wanted[0].gain)]
     rivals = [c for c in promising[: s.rivals] if c.gain > s.hopeless * promising[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
     own = partial(refit_with, fit, [], s.steps, seed, seen.own)
     controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
-    anew = partial(_rebuilt, rebuild, fit.extension, seed + 1)
-    controls.append(steps("fit", "rebuilding the control", f"turn{number}_rebuild", anew))
-    reference = best_likelihood(controls, split)
-
-    def trial(candidate: Candidate, again: SurfelFit) -> Trial:
-        likelihood = log_likelihood(again, split.select)
-        return Trial(candidate, again, compare(reference, likelihood, block), likelihood, candidate.gain * len(split.fit) / tested)
-
-    trials = []
-    for candidate in rivals:
-        name = candidate.effect.name
-        again = steps(
-            "refit", f"refitting with {name}", f"turn{number}_refit_{name}", partial(refit_with, fit, [candidate], s.steps, seed)
-        )
-        trials.append(trial(candidate, again))
-    trials.sort(key=lambda t: -t.evidence)
-    finalists = [(t.candidate, t.fit.extension) for k, t in enumerate(trials) if k < s.finalists or t.candidate is promising[0]]
+    tries = []
+    for c in rivals:
+        again = partial(refit_with, fit, [c], s.steps, seed)
+        tries.append((c, steps("refit", f"refitting with {c.effect.name}", f"turn{number}_refit_{c.effect.name}", again)))
+    weight = len(split.fit) / tested  # of a prediction for the tested spots
+    tries.sort(key=lambda t: -float(log_likelihood(t[1], split.select).sum()) - weight * t[0].gain)
+    finalists = [(c, again.extension) for k, (c, again) in enumerate(tries) if k < s.finalists or c is promising[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
         finalists += [(c, copy_effects(fit.extension, [null_of(c.effect)])) for c in bending]
-    steps.plan(fit=len(finalists))
-    for candidate, extension in finalists:
-        name = candidate.effect.name
-        again = steps(
-            "fit", f"rebuilding the scene with {name}", f"turn{number}_rebuild_{name}", partial(_rebuilt, rebuild, extension, seed)
-        )
-        if again is not None:
-            trials.append(trial(candidate, again))
-    trials = best_of_each(trials)
+    steps.plan(fit=1 + len(finalists))
+    jobs = [("rebuilding the control", f"turn{number}_rebuild", partial(_rebuilt, rebuild, fit.extension, seed + 1))]
+    for c, extension in finalists:
+        text, name = f"rebuilding the scene with {c.effect.name}", f"turn{number}_rebuild_{c.effect.name}"
+        jobs.append((text, name, partial(_rebuilt, rebuild, extension, seed)))
+    control, *rebuilt = steps.several("fit", jobs, s.processes)
+    controls.append(control)
+    tries += [(c, again) for (c, _), again in zip(finalists, rebuilt, strict=True) if again is not None]
+    reference, block = best_likelihood(controls, split), split.block[split.select]
+
+    def trial(candidate: Candidate, again: SurfelFit) -> Trial:
+        likelihood = log_likelihood(again, split.select)
+        return Trial(candidate, again, compare(reference, likelihood, block), likelihood, weight * candidate.gain)
+
+    trials = best_of_each([trial(c, again) for c, again in tries])
     share = len(split.select) / tested
     held = [t for t in trials if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over))]
     if not held:

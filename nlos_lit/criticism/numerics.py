@@ -16,11 +16,21 @@ from nlos_lit.surfel_fit import SurfelFit
 
 
 def numerics(
-    pipeline: BasePipeline, capture: Capture, split: Split, image: tuple[Tensor, VolumeGrid], base: SurfelFit, seed: int
+    pipeline: BasePipeline,
+    capture: Capture,
+    split: Split,
+    image: tuple[Tensor, VolumeGrid],
+    base: SurfelFit,
+    seed: int,
+    other: SurfelFit | None = None,
 ) -> dict[str, float]:
-    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted surfels."""
+    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted surfels.
+
+    ``other``: a fit with another seed, where there is one.
+    """
     reference = score(base, split.select).deviance_per_bin
-    other = pipeline.fit(capture, split, image, Extension([]), seed + 1)
+    if other is None:
+        other = pipeline.fit(capture, split, image, Extension([]), seed + 1)
     finer = base.copy(base.extension, seed)
     finer.model.quadrature = math.ceil(1.5 * base.model.quadrature)
     return {

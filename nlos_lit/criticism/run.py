@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -71,6 +72,8 @@ def diagnose(
     checks = {}
     if options.numerics:
         steps.plan(check=1)
-        checks = steps("check", "varying the numerics", "numerics", lambda: numerics(pipeline, capture, split, image, base, seed))
+        other = found.turns[0].controls[-1] if found.turns[0].controls else None
+        vary = partial(numerics, pipeline, capture, split, image, base, seed, other)
+        checks = steps("check", "varying the numerics", "numerics", vary)
     seconds = time.perf_counter() - began
     return assemble(capture, found, split, scan, options, null, checks, name, seconds, seed), found

@@ -12,7 +12,7 @@ weighs effects with one and with thirty coefficients on the same scale, and misf
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import torch
@@ -25,6 +25,8 @@ from nlos_lit.effects.base import Effect
 
 FOLDS = 6
 KEPT = 16  # shapes of one effect that are tested in full
+TOGETHER = 128  # columns from which on no more effects are projected along
+Tried = tuple[Effect, list[tuple[dict[str, float], Tensor]]]
 PRIOR_SCALES = (1.0, 0.25)  # of the deviations of priors on coefficients
 
 
@@ -95,12 +97,45 @@ def screen(problem: Problem, projector: Projector, effects: list[Effect], folds:
     Args:
         effects: at their nulls. folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block belongs to.
     """
-    found = [_per_spot(problem, projector, e) if e.per_spot else _score(problem, projector, e, folds) for e in effects]
+    found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
+    others = (e for e in effects if not e.per_spot)
+    for group in _groups((e, _worthwhile(problem, projector, e)) for e in others):
+        raw = torch.cat([columns for _, kept in group for _, columns in kept], 1)
+        z, weights = projector.apart(raw)
+        start = 0
+        for effect, kept in group:
+            tested = []
+            for shape, columns in kept:
+                part = slice(start, start := start + columns.shape[1])
+                tested.append((shape, columns, z[:, part].contiguous(), weights[:, part]))
+            found.append(_score(problem, projector, effect, tested, folds))
     return sorted(found, key=lambda c: -c.gain)
 
 
-def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor) -> Candidate:
-    """The best shape's score test; its p-value pays for the shapes tried."""
+def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
+    """Effects whose columns are projected together: a projection passes over all nuisance columns, however few it projects."""
+    group, width = [], 0
+    for effect, kept in tried:
+        group.append((effect, kept))
+        width += sum(columns.shape[1] for _, columns in kept)
+        if width >= TOGETHER:
+            yield group
+            group, width = [], 0
+    if group:
+        yield group
+
+
+def _score(
+    problem: Problem,
+    projector: Projector,
+    effect: Effect,
+    tested: list[tuple[dict[str, float], Tensor, Tensor, Tensor]],
+    folds: Tensor,
+) -> Candidate:
+    """The best shape's score test; its p-value pays for the shapes tried.
+
+    ``tested``: shape, its columns, its projected columns, what was taken off them.
+    """
     shapes = effect.shape_grid()
     spots, bins = problem.expected.shape
     lower = torch.cat([torch.full((p.size,), (p.lower - p.null) / p.scale) for p in effect.amplitudes]).double()
@@ -108,7 +143,7 @@ def _score(problem: Problem, projector: Projector, effect: Effect, folds: Tensor
     prior = effect.precision()[: len(lower)].double()
     scales = PRIOR_SCALES if bool(prior.any()) else (1.0,)
     best: Candidate | None = None
-    for shape, raw, z, weights in _projected(problem, projector, effect, shapes):
+    for shape, raw, z, weights in tested:
         k = z.shape[1]
         by_spot = z.view(spots, bins, k)
         score = torch.einsum("sbk,sb->sk", by_spot, projector.residual.view(spots, bins)).double()
@@ -146,15 +181,13 @@ def _predicted(score: Tensor, information: Tensor, ridge: Tensor, lower: Tensor,
     return gain
 
 
-def _projected(
-    problem: Problem, projector: Projector, effect: Effect, shapes: list[dict[str, float]]
-) -> Iterator[tuple[dict[str, float], Tensor, Tensor, Tensor]]:
-    """Shape, its columns, its projected columns, what was taken off them; for the shapes most worth it.
+def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[tuple[dict[str, float], Tensor]]:
+    """The ``KEPT`` most promising shapes with their columns.
 
     Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what costs. So shapes are
-    ranked by the score over the unprojected information first.
+    ranked by the score over the unprojected information.
     """
-    ranked = []
+    shapes, ranked = effect.shape_grid(), []
     for shape in shapes:
         effect.set_all(shape)
         z = weighted_columns(problem, effect)
@@ -163,12 +196,11 @@ def _projected(
         worth = float(score @ torch.linalg.solve(information + floor * torch.eye(len(score)), score))
         ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
     ranked.sort(key=lambda entry: -entry[0])
-    columns = []
+    kept = []
     for _, shape, z in ranked[:KEPT]:
         effect.set_all(shape)
-        columns.append(weighted_columns(problem, effect) if z is None else z)
-    projected, weights = (t.split(columns[0].shape[1], dim=1) for t in projector.apart(torch.cat(columns, 1)))
-    yield from zip([r[1] for r in ranked[:KEPT]], columns, (p.contiguous() for p in projected), weights, strict=True)
+        kept.append((shape, weighted_columns(problem, effect) if z is None else z))
+    return kept
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:

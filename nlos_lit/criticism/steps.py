@@ -6,8 +6,11 @@ import io
 import pickle
 import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
+
+import torch
 
 from nlos_lit.errors import UserError
 
@@ -55,8 +58,21 @@ class Steps:
         unit = max((known[kind] / SHARE[kind] for kind in known), default=0.0) if "fit" not in known else known["fit"]
         return sum(number * known.get(kind, unit * SHARE[kind]) for kind, number in self.ahead.items())
 
-    def __call__(self, kind: str, text: str, name: str, make: Callable[[], T]) -> T:
-        """The result of ``make``, or of an earlier call that was kept under ``name``."""
+    def several(self, kind: str, jobs: list[tuple[str, str, Callable[[], T]]], at_once: int) -> list[T]:
+        """Results of independent steps (text, name, make), ``at_once`` of them at a time with a single thread of torch each."""
+        if at_once == 1:
+            return [self(kind, *job) for job in jobs]
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        pool = ThreadPoolExecutor(at_once, initializer=torch.set_num_threads, initargs=(1,))
+        try:
+            return list(pool.map(lambda job: self(kind, *job, at_once=at_once), jobs))
+        finally:
+            pool.shutdown(cancel_futures=True)
+            torch.set_num_threads(threads)
+
+    def __call__(self, kind: str, text: str, name: str, make: Callable[[], T], at_once: int = 1) -> T:
+        """The result of ``make``, or of an earlier call that was kept under ``name``; ``at_once`` steps go on side by side."""
         file = None if self.folder is None else self.folder / f"{name}.pickle"
         if file is not None and file.exists():
             self.ahead[kind] = max(0, self.ahead[kind] - 1)
@@ -64,7 +80,7 @@ class Steps:
         self.report(text, time.monotonic() - self.began, self.left())
         began = time.monotonic()
         result = make()
-        self.taken.setdefault(kind, []).append(time.monotonic() - began)
+        self.taken.setdefault(kind, []).append((time.monotonic() - began) / at_once)
         self.ahead[kind] = max(0, self.ahead[kind] - 1)
         if file is not None:
             self._keep(file, result)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
+import time
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -75,6 +78,38 @@ def test_time_left_by_hand(monkeypatch):
     assert said == [("base", 0, 0), ("one", 10, 10 + 2 * 3), ("two", 12, 10 + 2), ("last", 16, 10)]
     steps.plan(refit=3)
     assert steps.left() == pytest.approx(3 * 3)
+
+
+def test_steps_side_by_side(tmp_path):
+    """Both at once (each waits for the other), with one thread of torch, in the order asked for; what was kept is not repeated."""
+    before, meet, threads = torch.get_num_threads(), threading.Barrier(2, timeout=20), []
+
+    def together(value: int) -> int:
+        threads.append(torch.get_num_threads())
+        meet.wait()
+        return value
+
+    jobs = [("one", "one", partial(together, 1)), ("two", "two", partial(together, 2))]
+    assert Steps(folder=tmp_path).several("fit", jobs, 2) == [1, 2]
+    assert threads == [1, 1]
+    assert torch.get_num_threads() == before
+    assert Steps(folder=tmp_path).several("fit", [*jobs, ("three", "three", lambda: 3)], 2) == [1, 2, 3]
+    assert len(threads) == 2
+
+
+def test_a_failed_step_stops_those_that_wait(tmp_path):
+    def broken():
+        raise UserError("no surface")
+
+    def slow(k: int) -> None:
+        time.sleep(0.05)
+        made.append(k)
+
+    made = []
+    jobs = [("broken", "broken", broken)] * 2 + [(f"{k}", f"{k}", partial(slow, k)) for k in range(50)]
+    with pytest.raises(UserError, match="no surface"):
+        Steps(folder=tmp_path).several("fit", jobs, 2)
+    assert len(made) < 50
 
 
 class Pipeline:
