@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from nlos_lit.callbacks import Bar, Figures, History, Scores
 from nlos_lit.command import quiet_libraries, quote_numbers, refuse_finished_folder, sentence_errors, write_config
 from nlos_lit.results import refine_run, shown_spots, write_results
-from nlos_lit.runs import find_checkpoint, prepare_run
+from nlos_lit.runs import field_shards, find_checkpoint, prepare_run
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def main(config: DictConfig) -> None:
     if settings["trainer"]["threads"]:
         torch.set_num_threads(settings["trainer"]["threads"])
     device = "cuda" if settings["trainer"]["accelerator"] == "gpu" else "cpu"
-    run = prepare_run(settings, device)
+    run = prepare_run(settings, device, field_shards(settings))
     monitor, history = settings["monitor"], History()
     trainer = L.Trainer(
         accelerator=settings["trainer"]["accelerator"],
@@ -69,6 +69,7 @@ def main(config: DictConfig) -> None:
         name = settings["scene"]["name"]
         log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder)
         sys.exit(130)
+    run.module.pipeline.phasor.hold()  # with the processes that end here
     if not trainer.is_global_zero:
         return
     refined = refine_run(run, folder) if settings["refine"] or settings["effects"] else None

@@ -77,8 +77,8 @@ class Bar(L.Callback):
             self.ticker = Ticker("iterations", trainer.max_epochs, trainer.current_epoch)
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: SelfCalibration) -> None:
+        metrics = trainer.callback_metrics  # asked by every process: it waits for the others
         if self.ticker is not None:
-            metrics = trainer.callback_metrics
             parts = [f"loss {float(metrics['loss/total']):.3e}"] if "loss/total" in metrics else []
             parts += [f"held-out NMSE {float(metrics['heldout/nmse']):.4f}"] if "heldout/nmse" in metrics else []
             self.ticker.update(trainer.current_epoch + 1, ", ".join(parts))
@@ -107,18 +107,23 @@ class Figures(L.Callback):
         self.every, self.spots, self.folder = every, spots, folder
 
     def on_train_start(self, trainer: L.Trainer, module: SelfCalibration) -> None:
+        phasor = module.pipeline.phasor
+        phasor.hold()
         self._show(trainer, module)
         if trainer.is_global_zero and trainer.current_epoch == 0:
             with torch.no_grad():
-                volume = module.pipeline.phasor().cpu().numpy()
-            grid, threshold = module.pipeline.phasor.grid, module.pipeline.geometry.threshold
+                volume = phasor().cpu().numpy()
+            grid, threshold = phasor.grid, module.pipeline.geometry.threshold
             shown = figures.volume_projections(volume, grid, threshold=threshold, title="intensity before the first iteration")
             figures.save_figure(shown, self.folder / "volume_first.png")
+        phasor.release()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: SelfCalibration) -> None:
         step = trainer.current_epoch + 1
         if step % self.every == 0 or step == trainer.max_epochs:
+            module.pipeline.phasor.hold()
             self._show(trainer, module)
+            module.pipeline.phasor.release()
 
     def _show(self, trainer: L.Trainer, module: SelfCalibration) -> None:
         if trainer.is_global_zero and isinstance(trainer.logger, L.pytorch.loggers.TensorBoardLogger):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import lightning as L
 import torch
 from torch import Tensor
 
+from nlos_lit.functional.sharded import leave_buffers
 from nlos_lit.metrics import expected_deviance, nmse_noise_floor, poisson_deviance
 from nlos_lit.objective import Objective, adam, parameter_groups
 from nlos_lit.pipeline import Pipeline
@@ -23,7 +25,7 @@ class SelfCalibration(L.LightningModule):
     run repeats the uninterrupted one.
 
     Args:
-        pipeline: the simulated measurement, its phasor field prepared.
+        pipeline: the simulated measurement, its phasor field prepared (or by ``prepare``).
         scale: counts that the loss counts as 1.
         optimise: which of ``phasor``, ``sensor``, ``albedo`` are fitted; the others keep their start values.
         rates: learning rate per group, on the unconstrained parameters.
@@ -31,6 +33,7 @@ class SelfCalibration(L.LightningModule):
         albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes all.
         clip: largest joint gradient norm; None does not clip.
         seed: of the batches of voxels.
+        prepare: makes the phasor field once the processes that share it know each other; None where it is made.
     """
 
     def __init__(
@@ -45,16 +48,23 @@ class SelfCalibration(L.LightningModule):
         albedo_planes: int | None = None,
         clip: float | None = None,
         seed: int = 0,
+        prepare: Callable[[], None] | None = None,
     ) -> None:
         super().__init__()
         self.pipeline, self.scale, self.rates, self.clip = pipeline, scale, rates, clip
         self.criterion = Objective(scale, lambda_sparsity, lambda_albedo, albedo_planes, seed)
-        self.groups = parameter_groups(pipeline)
-        for name, parameters in self.groups.items():
-            for parameter in parameters:
-                parameter.requires_grad_(optimise[name])
-        self.optimised = [name for name in self.groups if optimise[name]]
+        self.optimised = [name for name in parameter_groups(pipeline) if optimise[name]]
         self.scores: dict[str, dict[str, float]] = {}
+        self._prepare = prepare
+        self._freeze()
+
+    def setup(self, stage: str) -> None:
+        if self._prepare is not None:
+            self.pipeline.to(self.trainer.strategy.root_device)
+            self._prepare()
+            self._prepare = None
+            self._freeze()  # matching the energy makes a new parameter
+        leave_buffers(self)
 
     def imaging_parameters(self) -> dict[str, dict[str, Any]]:
         """The six imaging parameters by the paper's names: ``{name: {"value", "unit"}}``."""
@@ -90,6 +100,7 @@ class SelfCalibration(L.LightningModule):
         self._add_score(batch)
 
     def on_validation_epoch_start(self) -> None:
+        self.pipeline.phasor.hold()
         self._sums = torch.zeros(6, dtype=torch.float64, device=self.device)
 
     def on_validation_epoch_end(self) -> None:
@@ -117,6 +128,13 @@ class SelfCalibration(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         self.scores = checkpoint["scores"]
 
+    def _freeze(self) -> None:
+        """What is not optimised keeps its value."""
+        self.groups = parameter_groups(self.pipeline)
+        for name, parameters in self.groups.items():
+            for parameter in parameters:
+                parameter.requires_grad_(name in self.optimised)
+
     def _add_score(self, batch: dict[str, Tensor]) -> None:
         counts, expected = batch["counts"], self.pipeline(batch["spots"]).expected
         noise = expected_deviance(expected) * counts.numel()
@@ -133,6 +151,7 @@ class SelfCalibration(L.LightningModule):
         )
 
     def _finish_score(self) -> dict[str, float]:
+        self.pipeline.phasor.release()
         sums = self._sums
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.all_reduce(sums)

@@ -68,5 +68,7 @@ def adam(pipeline: Pipeline, rates: dict[str, float], optimised: list[str]) -> t
 
 
 def communicated_bytes(pipeline: Pipeline) -> int:
-    """Gradients that each process of a distributed run hands over in an iteration (a ring sends this about twice)."""
-    return sum(p.numel() * p.element_size() for group in parameter_groups(pipeline).values() for p in group)
+    """What each process of a distributed run hands over in an iteration: gradients and, where the field is shared, its volume's."""
+    gradients = sum(p.numel() * p.element_size() for group in parameter_groups(pipeline).values() for p in group)
+    phasor = pipeline.phasor
+    return gradients + (0 if phasor.slabs is None else phasor.slabs.handed_over(phasor.grid.shape[1] * phasor.grid.shape[2]))

@@ -16,6 +16,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.errors import MemoryBudgetError
 from nlos_lit.functional import phasor as F
 from nlos_lit.functional.even import convolution_length
+from nlos_lit.functional.sharded import GatherPlanes, Slabs, most_planes
 from nlos_lit.functional.streamed import SLAB_BYTES, FieldFile, StreamedMagnitude
 from nlos_lit.grid import VolumeGrid
 from nlos_lit.parameters import BoundedParameter
@@ -38,6 +39,7 @@ class PhasorPlan:
     field_bytes: int
     reading_bytes: int  # transients and their spectra, before there is a field
     working_bytes: int  # beside the field while it is propagated
+    shards: int = 1  # processes that share the depth planes; bytes are those of one of them
 
     @property
     def resident_bytes(self) -> int:
@@ -54,6 +56,7 @@ class PhasorPlan:
         return (
             f"phasor basis by {'FFT convolution' if self.method == 'lattice' else 'direct sum'}: {self.n_frequencies} frequencies "
             f"in {self.rank} dimensions, {self.field_bytes / 2**30:.2f} GiB {kind} + {self.working_bytes / 2**30:.2f} GiB working"
+            + (f" in each of {self.shards} processes" if self.shards > 1 else "")
         )
 
 
@@ -101,16 +104,23 @@ class PhasorImaging(nn.Module):
         self.power, self.tolerance = float(power), tolerance
         self.register_buffer("field", torch.empty(0), persistent=False)
         self.file: FieldFile | None = None  # holds the field instead, where it is streamed
+        self.slabs: Slabs | None = None  # where processes share the field
+        self.image: Tensor | None = None  # what forward returns while it is held
         self.register_buffer("basis", torch.empty(0), persistent=False)
         self.register_buffer("omega", torch.empty(0), persistent=False)
         gain = torch.tensor(grid.z / grid.z.max(), dtype=torch.float32) ** depth_exponent
         self.register_buffer("gain", gain[:, None, None], persistent=False)
 
-    def plan(self, capture: Capture, memory_budget: int) -> PhasorPlan:
+    def plan(self, capture: Capture, memory_budget: int, shards: int = 1) -> PhasorPlan:
         """Frequencies, rank, precision, place and bytes for this capture: single precision in memory, half, or single on disk.
+
+        Args:
+            memory_budget: bytes, of one process.
+            shards: processes that share the depth planes.
 
         Raises:
             MemoryBudgetError: not even what propagates the field fits ``memory_budget`` bytes, or the disk is too small.
+            UserError: more ``shards`` than depth planes.
         """
         omega = self._frequencies(capture)
         bounds = (self.omega_pf.lower, self.omega_pf.upper), (self.sigma_pf.lower, self.sigma_pf.upper)
@@ -127,10 +137,11 @@ class PhasorImaging(nn.Module):
             propagating = spectra + max(16 * n_freq * capture.n_spots * layout.refine**2, layout.plane_bytes(n_freq, rank))
         # Transients and spectra are gone when planes are propagated.
         reading, working = reading + _SCRATCH, propagating + _SCRATCH
-        values, method = self.grid.n_voxels * 2 * rank, "direct" if layout is None else "lattice"
+        planes, nx, ny = self.grid.shape
+        values, method = most_planes(planes, shards) * nx * ny * 2 * rank, "direct" if layout is None else "lattice"
         for precision, size, on_disk in ((torch.float32, 4, False), (torch.float16, 2, False), (torch.float32, 4, True)):
-            plan = PhasorPlan(method, n_freq, rank, precision, on_disk, values * size, reading, working)
-            if plan.total_bytes <= memory_budget and not (on_disk and plan.field_bytes > _free_disk()):
+            plan = PhasorPlan(method, n_freq, rank, precision, on_disk, values * size, reading, working, shards)
+            if plan.total_bytes <= memory_budget and not (on_disk and plan.field_bytes * shards > _free_disk()):
                 return plan
         raise MemoryBudgetError(
             f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB of memory and "
@@ -150,6 +161,8 @@ class PhasorImaging(nn.Module):
     ) -> None:
         """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]`` (or its file).
 
+        Of a plan for several processes each calls this and propagates the voxels of its own planes.
+
         Args:
             progress: called with (planes or blocks done, of how many).
         """
@@ -158,12 +171,15 @@ class PhasorImaging(nn.Module):
         # Only ratios matter (the intensity has a unit maximum); this scale keeps half precision in range.
         scale = float(spectrum.abs().mean()) * capture.n_spots / nearest**2
         layout = self._layout(capture)
+        self.slabs = Slabs.join(self.grid.shape[0], plan.shards) if plan.shards > 1 else None
+        planes = slice(0, self.grid.shape[0]) if self.slabs is None else self.slabs.own
+        voxels = (planes.stop - planes.start) * self.grid.shape[1] * self.grid.shape[2]
         if layout is None:
-            blocks, total = self._direct(capture, spectrum), -(-self.grid.n_voxels // 256)
+            blocks, total = self._direct(capture, spectrum, planes), -(-voxels // 256)
         else:
-            blocks, total = self._lattice(layout, spectrum), self.grid.shape[0]
+            blocks, total = self._lattice(layout, spectrum, planes), planes.stop - planes.start
         del spectrum  # the propagation drops it, too, as soon as it can
-        shape, device = (self.grid.n_voxels, 2, self.basis.shape[1]), self.gain.device
+        shape, device = (voxels, 2, self.basis.shape[1]), self.gain.device
         self.file = FieldFile(shape, device) if plan.on_disk else None
         field = torch.empty((0,) if plan.on_disk else shape, dtype=plan.precision, device=device)
         row = 0
@@ -179,15 +195,33 @@ class PhasorImaging(nn.Module):
         self.field = field
 
     def forward(self) -> Tensor:
-        """``[nz, nx, ny]`` intensity with a unit maximum."""
+        """``[nz, nx, ny]`` intensity with a unit maximum; all processes that share the field call it together."""
+        if self.image is not None and not torch.is_grad_enabled():
+            return self.image
         weights = F.virtual_illumination(self.omega, self.omega_pf(), self.sigma_pf())
         mixed = (self.basis.T @ weights.to(self.basis.dtype)).to(torch.float32)
         if self.file is not None:
-            magnitude = StreamedMagnitude.apply(mixed, self.file).view(self.grid.shape)
+            magnitude = StreamedMagnitude.apply(mixed, self.file)
         else:
-            magnitude = F.PhasorMagnitude.apply(self.field, mixed).view(self.grid.shape)
+            magnitude = F.PhasorMagnitude.apply(self.field, mixed)
+        magnitude = magnitude.view(-1, *self.grid.shape[1:])
+        if self.slabs is not None:
+            magnitude = GatherPlanes.apply(magnitude, self.slabs)
         intensity = self.gain * (magnitude if self.power == 1 else magnitude**self.power)
         return intensity / intensity.max()
+
+    @torch.no_grad()
+    def hold(self) -> None:
+        """Keep the volume as it is now for all that asks for it without gradients until :meth:`release`.
+
+        All processes that share the field call this together; after that each may look at the volume as often as it likes.
+        """
+        self.image = None
+        self.image = self()
+
+    def release(self) -> None:
+        """The opposite of :meth:`hold`."""
+        self.image = None
 
     def _window(self, capture: Capture) -> tuple[int, int]:
         """Bins inside the gate from which a virtual pulse can reach a voxel."""
@@ -229,7 +263,7 @@ class PhasorImaging(nn.Module):
         padded = [convolution_length(n, m, o) for n, m, o in zip(sizes, grid.shape[1:], offset, strict=True)]
         return LatticeLayout(geometry, refine, offset, padded[0] * padded[1])
 
-    def _lattice(self, layout: LatticeLayout, spectrum: Tensor) -> Iterator[Tensor]:
+    def _lattice(self, layout: LatticeLayout, spectrum: Tensor, planes: slice) -> Iterator[Tensor]:
         geometry, refine = layout.geometry, layout.refine
         nx, ny = geometry.lattice.shape
         field = spectrum[:, torch.from_numpy(geometry.rows)].permute(1, 0, 2).reshape(len(geometry.rows), -1, nx, ny)
@@ -248,13 +282,13 @@ class PhasorImaging(nn.Module):
             pitch=self.grid.pitch[:2],
             offset=layout.offset,
             shape=self.grid.shape[1:],
-            depth=torch.from_numpy(self.grid.z - plane),
+            depth=torch.from_numpy(self.grid.z[planes] - plane),
             fixed=fixed,
             voxel_origin=self.grid.origin[:2],
         )
 
-    def _direct(self, capture: Capture, spectrum: Tensor) -> Iterator[Tensor]:
-        z, x, y = np.meshgrid(self.grid.z, self.grid.x, self.grid.y, indexing="ij")
+    def _direct(self, capture: Capture, spectrum: Tensor, planes: slice) -> Iterator[Tensor]:
+        z, x, y = np.meshgrid(self.grid.z[planes], self.grid.x, self.grid.y, indexing="ij")
         voxels = torch.from_numpy(np.stack([x, y, z], axis=-1).reshape(-1, 3))
         return F.direct_phasors(
             spectrum, self.omega, self.basis, torch.from_numpy(capture.laser), torch.from_numpy(capture.sensor), voxels

@@ -51,8 +51,27 @@ def pipeline_settings(model: Mapping[str, Any]) -> PipelineSettings:
     return PipelineSettings(**{name: value for name, value in model.items() if name not in _MODULE_KEYS})
 
 
-def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -> Run:
+def field_shards(config: Mapping[str, Any]) -> int:
+    """Processes that share the phasor field of a ``train.py`` config.
+
+    Raises:
+        UserError: shared by a single process, or by an unknown number of them.
+    """
+    devices = config["trainer"]["devices"]
+    if not config["shard_field"]:
+        return 1
+    if not isinstance(devices, int) or devices < 2:
+        raise UserError(
+            "shard_field=true divides the phasor field among processes, which needs trainer=ddp and trainer.devices=2 or more; "
+            f"found trainer.devices={devices}"
+        )
+    return devices
+
+
+def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", shards: int = 1) -> Run:
     """Everything before the first iteration: capture, volume, memory estimate, propagated phasor field, start values.
+
+    Where several processes share the field (``shards``), it and the start values are made when the fit begins.
 
     Raises:
         UserError: the data, the geometry or the settings cannot work; nothing has been written then.
@@ -73,10 +92,10 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
     )
     settings = pipeline_settings(config["model"])
     pipeline = build_pipeline(capture, grid, settings).to(device)
-    plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]))
+    plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]), shards)
     rays = settings.rays**2 * config["batch_spots"]
     planned = run_bytes(plan, grid.n_voxels, rays) + LATER_LIBRARIES
-    check_machine(planned, "this run")
+    check_machine(planned * shards, "this run")
     estimated = planned + resident_bytes()
     log.info(
         "%s: %d spots x %d bins of %.3g ps, %s; volume %d x %d x %d voxels, depth %.3g to %.3g m",
@@ -85,10 +104,20 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
     )  # fmt: skip
     log.info("%s; about %.1f GiB in all", plan, estimated / 2**30)
     imaged = None if config["heldout"]["imaging"] else data.train_spots
-    with planes_progress("propagating the phasor field") as progress:
-        pipeline.phasor.prepare(capture, plan, spots=imaged, progress=progress)
     start = np.random.default_rng([seed, 1]).permutation(data.train_spots)[: config["batch_spots"] * 2]
-    match_energy(pipeline, capture, torch.from_numpy(np.sort(start)).to(device))
+
+    def prepare() -> None:
+        with planes_progress("propagating the phasor field") as progress:
+            pipeline.phasor.prepare(capture, plan, spots=imaged, progress=progress)
+        match_energy(pipeline, capture, torch.from_numpy(np.sort(start)).to(device))
+
+    def prepare_shared() -> None:
+        began = time.perf_counter()
+        prepare()
+        run.setup_seconds += time.perf_counter() - began
+
+    if shards == 1:
+        prepare()
     model, optimise = config["model"], config["ablation"]["optimise"]
     module = SelfCalibration(
         pipeline,
@@ -100,8 +129,10 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu") -
         albedo_planes=model["albedo_planes"],
         clip=model["clip"],
         seed=seed,
+        prepare=prepare_shared if shards > 1 else None,
     )
-    return Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated, extension)
+    run = Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated, extension)
+    return run
 
 
 def open_run(folder: str | Path) -> Run:

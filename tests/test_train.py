@@ -242,6 +242,7 @@ BAD = {
     "effects=[irf_tail,pileup]": "no effect 'pileup'; choose from retroreflection",
     "memory_budget=1MiB": "the budget is",
     "memory_budget=lots": "must be a size",
+    "shard_field=true": "needs trainer=ddp and trainer.devices=2 or more; found trainer.devices=1",
     "model.threshold=1.5": "threshold must lie between 0 and 1",
     "heldout.block=50": "hold out",
     "ckpt_path=nothing.ckpt": "does not exist",
