@@ -176,6 +176,7 @@ class Training:
         capture: as from :func:`synthetic_capture`.
         profile: "default" or "paper".
         budget: memory budget for the phasor field, bytes.
+        shards: processes that share the field.
     """
 
     def __init__(
@@ -187,6 +188,7 @@ class Training:
         budget: int = 12 << 30,
         device: torch.device | str = "cpu",
         seed: int = 0,
+        shards: int = 1,
     ) -> None:
         self.workload, self.device = workload, torch.device(device)
         settings, sparsity = PROFILES[profile]
@@ -197,7 +199,7 @@ class Training:
             grid,
             PipelineSettings(threshold=workload.threshold, rays=workload.rays, wavelength=workload.wavelength, **settings),
         ).to(self.device)
-        self.plan: PhasorPlan = self.pipeline.phasor.plan(capture, budget)
+        self.plan: PhasorPlan = self.pipeline.phasor.plan(capture, budget, shards)
         self.criterion = Objective(normalisation(capture), sparsity, LAMBDA_ALBEDO, 64, seed)
         self.capture, self.random, self.steps = capture, np.random.default_rng(seed), 0
         self.counts = torch.from_numpy(capture.gated_counts())

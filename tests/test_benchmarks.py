@@ -124,13 +124,17 @@ def test_table_2_command_at_a_tiny_size():
     assert row["total_s"] > row["setup_s"] > 0
 
 
-def test_two_processes_hand_over_the_gradients_and_nothing_else():
+def test_two_processes_hand_over_the_gradients_and_the_volume_where_they_divide_the_field():
     script = [sys.executable, "benchmarks/ddp.py", "sizes=tiny"]  # as a file: the processes it spawns import it
     done = subprocess.run(script, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     row = json.loads(done.stdout.splitlines()[-1])
-    assert row["counted_bytes"] == row["expected_bytes"] == 4 * (8 * 8 * 12 + 6)
-    assert row["difference"] < 1e-5
+    whole, divided = row["whole"], row["divided"]
+    voxels = 8 * 8 * 12
+    assert whole["counted_bytes"] == whole["expected_bytes"] == 4 * (voxels + 6)
+    assert divided["counted_bytes"] == divided["expected_bytes"] == 4 * (voxels + 6) + 4 * (voxels // 2 + voxels)
+    assert 2 * divided["field_bytes"] == whole["field_bytes"]
+    assert max(whole["difference"], divided["difference"]) < 1e-5
 
 
 def test_reports(tmp_path, monkeypatch):
