@@ -65,7 +65,7 @@ def work(name: str, spec: object) -> str:
     from nlos_lit.criticism.criticise import CriticismSettings
 
     one_thread()
-    outcome = run_case(spec, CriticismSettings(numerics=False))
+    outcome = run_case(spec, CriticismSettings(numerics=False, processes=1))
     part = STORE / f".{name}.json"
     part.write_text(json.dumps(outcome.to_dict()))
     part.rename(STORE / f"{name}.json")
