@@ -199,7 +199,7 @@ class PhasorImaging(nn.Module):
         if self.image is not None and not torch.is_grad_enabled():
             return self.image
         weights = F.virtual_illumination(self.omega, self.omega_pf(), self.sigma_pf())
-        mixed = (self.basis.T @ weights.to(self.basis.dtype)).to(torch.float32)
+        mixed = self.basis.T @ weights.to(self.basis.dtype)
         if self.file is not None:
             magnitude = StreamedMagnitude.apply(mixed, self.file)
         else:

@@ -25,7 +25,7 @@ SCANS = {
     "direct sum": "curved wall",
     "streamed": "refined",
 }
-TOLERANCE = {"volume": 0.0, "loss": 1e-6, "omega_pf": 1e-3, "sigma_pf": 1e-4}  # gradients that nearly cancel keep fewer digits
+TOLERANCE = {"volume": 0.0, "loss": 1e-6, "omega_pf": 2e-4}  # a gradient that nearly cancels keeps fewer digits
 
 
 def test_slabs_by_hand():

@@ -18,6 +18,7 @@ from torch import Tensor
 from nlos_lit.functional.even import EvenAxis, Rotation, even_transform, fold, inverse, mirror, polar, runs, unfold
 
 ROWS = 1 << 15  # of the field that are converted at once on a CPU
+RUN = 64  # rows that are summed in single precision
 
 
 def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> Tensor:
@@ -181,16 +182,28 @@ def direct_phasors(
         yield torch.view_as_real(_mix(weights, values)).permute(1, 2, 0).contiguous()
 
 
+def sum_of_rows(pull: Tensor, rows: Tensor) -> Tensor:
+    """``Σ_n pull[n] rows[n]`` ``[R]`` float64, at the speed of single precision: short runs are summed in it, these in double.
+
+    What Ω_pf gets of this sum is thousands of times smaller than the sum, so that its last digits count.
+    """
+    whole = len(rows) // RUN * RUN
+    sums = torch.bmm(pull[:whole].view(-1, 1, RUN), rows[:whole].view(-1, RUN, rows.shape[1]))
+    return sums.sum((0, 1), dtype=torch.float64) + (pull[whole:] @ rows[whole:]).double()
+
+
 class PhasorMagnitude(torch.autograd.Function):
     """``|Σ_r w_r A[v, r]|`` for all voxels; the backward pass touches only the voxels that received a gradient.
 
-    Inputs: basis field ``[V, 2, R]`` (any float type) and weights ``[R]`` float32. Output ``[V]`` float32, m⁻²-weighted counts.
+    Inputs: basis field ``[V, 2, R]`` (any float type) and weights ``[R]``, whose gradient is summed in double precision; to be kept
+    they must be float64. Output ``[V]`` float32 (float64 from a float64 field), m⁻²-weighted counts.
     """
 
     @staticmethod
     def forward(ctx, field: Tensor, weights: Tensor) -> Tensor:
         voxels = field.shape[0]
         rows = field.reshape(2 * voxels, -1)
+        weights = weights.to(torch.promote_types(field.dtype, torch.float32))
         if field.dtype == weights.dtype:
             parts = (rows @ weights).view(voxels, 2)
         else:
@@ -206,14 +219,14 @@ class PhasorMagnitude(torch.autograd.Function):
             pull = parts * torch.where(magnitude > 0, grad / magnitude, 0.0)[:, None]
             rows = field.reshape(2 * len(field), -1)
             if rows.dtype == parts.dtype:
-                return None, pull.view(-1) @ rows
+                return None, sum_of_rows(pull.view(-1), rows)
             pairs = zip(pull.view(-1).split(ROWS), rows.split(ROWS), strict=True)
-            return None, sum(part @ chunk.to(part.dtype) for part, chunk in pairs)
+            return None, sum(sum_of_rows(part, chunk.to(part.dtype)) for part, chunk in pairs)
         touched = torch.nonzero((grad != 0) & (magnitude > 0)).squeeze(1)
-        result = torch.zeros(field.shape[2], dtype=parts.dtype, device=parts.device)
-        for chunk in touched.split(ROWS):
+        result = torch.zeros(field.shape[2], dtype=torch.float64)
+        for chunk in touched.split(ROWS):  # collecting these rows takes most of the time, so they may as well be doubled
             pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
-            result += pull.reshape(-1) @ field[chunk].to(parts.dtype).reshape(-1, len(result))
+            result += pull.reshape(-1).double() @ field[chunk].double().reshape(-1, len(result))
         return None, result
 
 

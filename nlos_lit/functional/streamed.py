@@ -10,6 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.functional.phasor import sum_of_rows
+
 SLAB_BYTES = 64 * 2**20
 
 
@@ -48,7 +50,8 @@ class StreamedMagnitude(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, weights: Tensor, field: FieldFile) -> Tensor:
-        parts = torch.empty(field.shape[0], 2, dtype=weights.dtype, device=weights.device)
+        weights = weights.to(torch.float32)
+        parts = torch.empty(field.shape[0], 2, device=weights.device)
         for rows, slab in field.slabs():
             torch.matmul(slab, weights, out=parts[rows])
         magnitude = torch.linalg.vector_norm(parts, dim=1)
@@ -60,7 +63,7 @@ class StreamedMagnitude(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
         parts, magnitude = ctx.saved_tensors
         pull = parts * torch.where(magnitude > 0, grad / magnitude, 0.0)[:, None]
-        result = parts.new_zeros(ctx.field.shape[2])
+        result = parts.new_zeros(ctx.field.shape[2], dtype=torch.float64)
         for rows, slab in ctx.field.slabs():
-            result += pull[rows].reshape(-1) @ slab.reshape(-1, len(result))
+            result += sum_of_rows(pull[rows].reshape(-1), slab.reshape(-1, len(result)))
         return result, None
