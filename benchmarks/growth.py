@@ -13,8 +13,7 @@ import sys
 import time
 from dataclasses import replace
 
-import torch
-from report import growth_figure, slope, store, stored, table, write_section
+from report import growth_figure, perform, slope, store, stored, table, write_section
 from timing import machine, median, seconds
 from workload import Training, Workload, synthetic_capture
 
@@ -70,16 +69,5 @@ def report() -> None:
         write_section("growth", text + "\n\n![growth of set-up and iteration](images/growth.png)")
 
 
-def main(arguments: list[str]) -> None:
-    given = dict(a.split("=", 1) for a in arguments if "=" in a)
-    torch.set_num_threads(int(given.get("threads", 1)))
-    tasks = {"run": run, "report": report}
-    chosen = [a for a in arguments if "=" not in a] or list(tasks)
-    if not set(chosen) <= set(tasks):
-        raise SystemExit(__doc__)
-    for name in chosen:
-        tasks[name]()
-
-
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    perform({"run": run, "report": report}, sys.argv[1:], __doc__)

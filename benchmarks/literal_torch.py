@@ -1,4 +1,4 @@
-"""One training iteration as the paper formulates it, in batched float32 torch, as fast as that formulation allows.
+"""One training iteration as the paper formulates it, in batched torch, as fast as that formulation allows.
 
 Every depth and frequency is propagated by FFT in every iteration, every ray is sampled from the wall to the volume's far corner,
 and every path is spread over all time bins. What the formulation leaves open is taken in its favour: one FFT of the wall's field
@@ -9,6 +9,7 @@ blocks that fit memory, and what the backward pass needs of a block is computed 
 
 from __future__ import annotations
 
+import copy
 import math
 
 import torch
@@ -18,7 +19,7 @@ from torch.utils.checkpoint import checkpoint
 from workload import Training
 
 from nlos_lit.functional.concentric import wall_frame
-from nlos_lit.functional.phasor import spectrum, virtual_illumination
+from nlos_lit.functional.phasor import virtual_illumination
 from nlos_lit.losses import transient_loss
 
 
@@ -46,21 +47,33 @@ class _Propagation(torch.autograd.Function):
 
 
 class LiteralIteration:
-    """The same parameters, batch and objective as ``training`` (profile "paper", confocal, volume below the scan)."""
+    """The same parameters, batch and objective as ``training`` (profile "paper", confocal, volume below the scan).
 
-    def __init__(self, training: Training, samples_at_once: int = 1 << 22) -> None:
-        self.training, self.samples_at_once = training, samples_at_once
+    Args:
+        precision: float32 shares the parameters of ``training``; float64 has copies of them, and is what rounding is judged by.
+        reach: frequencies up to this many 1/σ_pf from Ω_pf; infinite takes all that the package has.
+    """
+
+    def __init__(
+        self, training: Training, precision: torch.dtype = torch.float32, reach: float = 5.5, samples_at_once: int = 1 << 22
+    ) -> None:
+        self.training, self.precision, self.samples_at_once = training, precision, samples_at_once
         pipeline, capture = training.pipeline, training.capture
+        if precision == torch.float64:
+            stored = pipeline.phasor.field  # not worth a copy
+            pipeline = copy.deepcopy(pipeline, {id(stored): stored.new_empty(0)}).double()
         self.pipeline, self.grid = pipeline, pipeline.phasor.grid
         phasor, geometry = pipeline.phasor, pipeline.geometry
         if not capture.confocal or phasor.power != 2 or geometry.fine != 1 or geometry.relative:
             raise ValueError("the literal iteration is written for confocal captures and the profile 'paper'")
         centre, sigma = float(phasor.omega_pf().detach()), float(phasor.sigma_pf().detach())
-        self.omega = phasor.omega[(phasor.omega - centre).abs() <= 5.5 / sigma]
+        self.omega = phasor.omega[(phasor.omega - centre).abs() <= reach / sigma]
         first, last = capture.gate
         time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length
         nx, ny = capture.scan_shape
-        self.field = spectrum(torch.from_numpy(capture.gated_counts()), time, self.omega).view(-1, nx, ny)
+        kernel = torch.polar(torch.ones((), dtype=torch.float64), self.omega[:, None] * time)
+        field = kernel @ torch.from_numpy(capture.gated_counts()).T.to(kernel.dtype)
+        self.field = field.to(torch.promote_types(precision, torch.complex32)).view(-1, nx, ny)
         self.field /= self.field.abs().mean()
         mx, my = self.grid.shape[1:]
         if (mx, my) != (nx, ny):
@@ -77,8 +90,8 @@ class LiteralIteration:
     def products(self, z: float) -> Tensor:
         """``[F, lx, ly]``: transform of the wall's field times that of every frequency's kernel for depth ``z``."""
         distance = torch.sqrt(self.lateral + z * z)
-        turns = torch.remainder(self.omega[:, None, None] * (-2 * distance), 2 * math.pi).float()
-        kernel = torch.polar((1 / distance**2).float().expand_as(turns), turns)
+        turns = torch.remainder(self.omega[:, None, None] * (-2 * distance), 2 * math.pi).to(self.precision)
+        kernel = torch.polar((1 / distance**2).to(self.precision).expand_as(turns), turns)
         return torch.fft.fft2(kernel).mul_(self.aperture)
 
     def step_on(self, spots: Tensor, counts: Tensor) -> Tensor:
@@ -95,7 +108,7 @@ class LiteralIteration:
         pipeline, criterion = self.pipeline, self.training.criterion
         phasor = pipeline.phasor
         self.aperture = torch.fft.fft2(self.field, s=self.padded)
-        weights = virtual_illumination(self.omega, phasor.omega_pf(), phasor.sigma_pf()).float()
+        weights = virtual_illumination(self.omega, phasor.omega_pf(), phasor.sigma_pf()).to(self.precision)
         field = _Propagation.apply(weights, self)
         intensity = field.real**2 + field.imag**2
         intensity = intensity / intensity.max()
@@ -118,7 +131,7 @@ class LiteralIteration:
     def depths(self, intensity: Tensor, origins: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
         """Softargmax ``[M]`` over all samples of rays ``[M, 3]``, and their largest intensity."""
         geometry = self.pipeline.geometry
-        distance = (torch.arange(self.n_samples) + 0.5) * geometry.step
+        distance = (torch.arange(self.n_samples, dtype=self.precision) + 0.5) * geometry.step
         value = self.at(intensity, origins[:, None] + distance[:, None] * direction[:, None])
         value = torch.where(value >= geometry.threshold, value, 0.0)
         top = value.detach().amax(1)
@@ -155,7 +168,7 @@ class LiteralIteration:
         contribution = self.at(albedo, point) * cosines / leg**2 * renderer.solid_angle
         arrival = (leg + distance[valid] - capture.t_start) / capture.bin_length
         rows = max(1, self.samples_at_once // renderer.n_bins)
-        rendered = torch.zeros(count, renderer.n_bins)
+        rendered = torch.zeros(count, renderer.n_bins, dtype=self.precision)
         for k, t, s in zip(contribution.split(rows), arrival.split(rows), spot.split(rows), strict=True):
             rendered = rendered + checkpoint(self.spread, k, t, s, count, use_reentrant=False)
         return rendered
@@ -163,9 +176,9 @@ class LiteralIteration:
     def spread(self, contribution: Tensor, arrival: Tensor, spot: Tensor, count: int) -> Tensor:
         """Eq. 7-9: every path over all bins by a Gaussian of unit peak."""
         renderer = self.pipeline.renderer
-        bins = torch.arange(renderer.n_bins) + 0.5
+        bins = torch.arange(renderer.n_bins, dtype=self.precision) + 0.5
         gauss = torch.exp(-0.5 * ((bins - arrival[:, None]) / renderer.splat_sigma) ** 2)
-        return torch.zeros(count, renderer.n_bins).index_add(0, spot, contribution[:, None] * gauss)
+        return torch.zeros(count, renderer.n_bins, dtype=self.precision).index_add(0, spot, contribution[:, None] * gauss)
 
 
 def _neighbour(point: Tensor, hit: Tensor, di: int, dj: int) -> tuple[Tensor, Tensor]:

@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = ROOT / "benchmarks" / "results" / "speed"
 PAGE = ROOT / "docs" / "speed.md"
+
+
+def perform(tasks: dict[str, Callable[[], None]], arguments: Sequence[str], usage: str) -> None:
+    """The tasks named among ``arguments``, all of them where none is, with ``threads=N`` of torch (one if not given)."""
+    given = dict(a.split("=", 1) for a in arguments if "=" in a)
+    chosen = [a for a in arguments if "=" not in a] or list(tasks)
+    if not set(chosen) <= set(tasks) or not set(given) <= {"threads"}:
+        raise SystemExit(usage)
+    torch.set_num_threads(int(given.get("threads", 1)))
+    for name in chosen:
+        tasks[name]()
 
 
 def _file(kind: str, name: str) -> Path:

@@ -222,10 +222,14 @@ class Training:
         """Forward, backward, Adam; the loss, still on the device."""
         return self.step_on(*self.batch())
 
+    def terms(self, spots: Tensor, counts: Tensor) -> dict[str, Tensor]:
+        """Loss terms of a batch."""
+        return self.criterion.terms(self.pipeline, spots, counts, self.steps)
+
     def step_on(self, spots: Tensor, counts: Tensor) -> Tensor:
         """:meth:`step` on a given batch."""
         self.optimiser.zero_grad()
-        loss = self.criterion.terms(self.pipeline, spots, counts, self.steps)["loss"]
+        loss = self.terms(spots, counts)["loss"]
         loss.backward()
         self.optimiser.step()
         self.steps += 1
