@@ -24,7 +24,7 @@ from report import store, stored, table, write_section
 from timing import machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
 
-from nlos_lit.memory import peak_bytes
+from nlos_lit.memory import peak_bytes, resident_bytes, run_bytes
 
 SAME = {"Erato": "Dragon", "Indonesian": "Dragon", "NLOS": "44i"}
 LEAST = 12  # iterations measured where the total is projected
@@ -33,8 +33,6 @@ GIB = 2**30
 
 def measure(workload: Workload, allowed_s: float, device: str = "cpu") -> dict[str, object]:
     """One configuration from its capture to its last iteration (or the projection of it)."""
-    from nlos_lit.memory import resident_bytes, run_bytes
-
     capture = synthetic_capture(workload)
     before = resident_bytes()
     began, began_cpu = time.perf_counter(), time.process_time()

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 import torch.distributed as dist
-from test_literal_pipeline import CASES, NAMES, build
+from literal_scenes import CASES, NAMES, build
 from test_train import state, train
 from torch.nn.parallel import DistributedDataParallel
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import literal
 import pytest
 import torch
-from test_literal_pipeline import CASES, NAMES, build
+from literal_scenes import CASES, NAMES, build
 
 from nlos_lit.functional.static import compact
 from nlos_lit.objective import Objective, adam

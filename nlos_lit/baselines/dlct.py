@@ -20,9 +20,8 @@ from collections.abc import Iterator
 
 import torch
 
-from nlos_lit.baselines.light_cone import Cone, cone_kernel, cone_to_depth, gated_bins, lateral_weights, light_cone, padded
+from nlos_lit.baselines.light_cone import Cone, cone_bytes, cone_kernel, cone_to_depth, lateral_weights, light_cone, padded
 from nlos_lit.baselines.resample import apply_weights
-from nlos_lit.baselines.scan import confocal_lattice
 from nlos_lit.capture import Capture
 from nlos_lit.errors import UserError
 from nlos_lit.grid import VolumeGrid
@@ -97,8 +96,4 @@ def _channels(cone: Cone, depth: float, snr: float) -> Iterator[torch.Tensor]:
 
 def dlct_bytes(capture: Capture, grid: VolumeGrid) -> int:
     """Bytes that :func:`dlct` allocates at its peak."""
-    lattice = confocal_lattice(capture, "dlct")
-    bins = gated_bins(capture, grid)
-    m, nx, ny = padded((bins, *lattice.shape))
-    native = bins * capture.n_spots
-    return 4 * (3 * native + 7 * m * nx * (ny + 2) + 5 * grid.n_voxels + 2 * bins * grid.shape[0])
+    return cone_bytes(capture, grid, "dlct", padded_arrays=7, volumes=5, matrices=2)

@@ -109,11 +109,16 @@ def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr
 
 def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
     """Bytes that :func:`lct` allocates at its peak."""
-    lattice = confocal_lattice(capture, "lct")
+    return cone_bytes(capture, grid, "lct", padded_arrays=4, volumes=1, matrices=1)
+
+
+def cone_bytes(capture: Capture, grid: VolumeGrid, method: str, *, padded_arrays: int, volumes: int, matrices: int) -> int:
+    """Bytes of a light-cone method: three copies of the transients, and at once so many arrays of the transform's size, volumes,
+    and matrices from the cone to depths; ``method`` is named in messages."""
     bins = gated_bins(capture, grid)
-    m, nx, ny = padded((bins, *lattice.shape))
-    native = bins * capture.n_spots
-    return 4 * (3 * native + 4 * m * nx * (ny + 2) + grid.n_voxels + bins * grid.shape[0])
+    m, nx, ny = padded((bins, *confocal_lattice(capture, method).shape))
+    transform, resampling = m * nx * (ny + 2), bins * grid.shape[0]
+    return 4 * (3 * bins * capture.n_spots + padded_arrays * transform + volumes * grid.n_voxels + matrices * resampling)
 
 
 def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
