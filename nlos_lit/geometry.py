@@ -142,13 +142,21 @@ class ImplicitGeometry(nn.Module):
         normal, valid = self._normals(point, direction, samples, origins.shape[0], found.used)
         return Surface(spot, distance, direction, point, torch.where((valid & found.used)[:, None], normal, 0.0))
 
+    def _places(self, samples: Samples, origins: Tensor, direction: Tensor) -> Tensor:
+        """``[M, 3]`` float64 samples at whole half steps along hit rays: β multiplies every rounding of a place by a thousand."""
+        unit = self.step / (2 * self.fine)
+        at = torch.empty(len(samples.hit), 3, dtype=torch.float64, device=origins.device)
+        for hit, distance, rows in zip(*(t.split(1 << 17) for t in (samples.hit, samples.distance, at)), strict=True):
+            whole = torch.round(distance.double() / unit) * unit
+            torch.addcmul(origins[samples.spot[hit]].double(), whole[:, None], direction[hit].double(), out=rows)
+        return at
+
     def _softargmax(
         self, intensity: Tensor, samples: Samples, origins: Tensor, direction: Tensor, static: StaticSamples | None = None
     ) -> Tensor:
         """``Σ ω_i d_i / Σ ω_i`` with ``ω_i = e^{β I_i}`` per hit ray ``[K]``; of ``static`` samples those that mean something."""
         hits = samples.spot.shape[0]
-        at = origins[samples.spot[samples.hit]] + samples.distance[:, None] * direction[samples.hit]
-        value = trilinear(intensity, at, self.lattice)
+        value = trilinear(intensity, self._places(samples, origins, direction), self.lattice)
         if static is not None:
             value = torch.where(static.used[:, None], torch.where(static.inside, value.view_as(static.inside), 0.0), 1.0).view(-1)
         # With a relative β the largest intensity scales the exponent, so the gradient passes through it; otherwise it cancels.

@@ -45,12 +45,10 @@ def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     size = constants((nx, ny, nz), points)
     position = torch.minimum(((points - lattice.origin) / lattice.pitch).clamp_min(0), size - 1)
     low = torch.minimum(position.detach().floor(), (size - 2).clamp_min(0))
-    part = position - low
+    part = (position - low).to(lattice.pitch.dtype)
     low = low.long()
     high = torch.minimum(low + 1, (size - 1).long())
-    x = torch.stack([low[:, 0], high[:, 0]], 1)
-    y = torch.stack([low[:, 1], high[:, 1]], 1)
-    z = torch.stack([low[:, 2], high[:, 2]], 1)
+    x, y, z = (torch.stack([low[:, axis], high[:, axis]], 1) for axis in range(3))
     weight = torch.stack([1 - part, part], 2)
     index = (z[:, :, None, None] * nx + x[:, None, :, None]) * ny + y[:, None, None, :]
     product = weight[:, 2, :, None, None] * weight[:, 0, None, :, None] * weight[:, 1, None, None, :]
@@ -94,7 +92,10 @@ class _Trilinear(torch.autograd.Function):
 
 @torch.no_grad()
 def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
-    """:func:`trilinear` without gradients, several times faster: the interpolation is fused into one kernel."""
+    """:func:`trilinear` without gradients; of points in single precision by a fused, faster kernel good to 1e-5 voxels."""
+    if points.dtype == torch.float64:
+        parts, flat = points.split(_ROWS) if points.device.type == "cpu" else (points,), volume.reshape(-1)
+        return torch.cat([(flat[index] * weight).sum(1) for index, weight in (corner_weights(p, lattice) for p in parts)])
     scale, shift = unit_scale(lattice)
     return sample_unit(volume, ((points - lattice.origin) * scale + shift)[:, [1, 0, 2]])
 
@@ -174,8 +175,7 @@ def march(
         fine: samples a step around the maximum.
         chunk: samples evaluated at once, bounds the memory.
     """
-    n = round(rays.shape[0] ** 0.5)
-    device = volume.device
+    n, device = round(rays.shape[0] ** 0.5), volume.device
     # Bricks about as deep as wide, four lateral cells across: small enough to skip, large enough to be few.
     deep = max(1, round(4 * abs(float(lattice.pitch[0] / lattice.pitch[2]))))
     size = (deep, 4, 4)
