@@ -151,6 +151,7 @@ def press(self, trainer, module):
     if trainer.current_epoch == 3:
         os.kill(os.getpid(), signal.SIGINT)
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit that it is ignored
 ModelCheckpoint.on_train_epoch_start = press
 runpy.run_path("train.py", run_name="__main__")
 """
