@@ -136,7 +136,7 @@ class SurfelFit:
         ``settle``: the first round comes from seeds, and the response waits for their places.
         Returns one entry a round: surfels, mean loss over its last quarter, response.
         """
-        s, history, done = self.settings, [], 0
+        s, history, begun = self.settings, [], self.done
         steps = steps or s.steps
         total = steps * (rounds + 1)
         for index in range(rounds):
@@ -148,9 +148,9 @@ class SurfelFit:
             losses = []
             for loss in self._round(rounds - 1 - index, index == 0 and settle, steps):
                 losses.append(loss)
-                done, self.done = done + 1, self.done + 1
+                self.done += 1
                 if progress is not None:
-                    progress(done, total)
+                    progress(self.done - begun, total)
             self.model.link()
             sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
             history.append({"surfels": len(self.model), "loss": float(np.mean(losses[-len(losses) // 4 :])), **sensor})

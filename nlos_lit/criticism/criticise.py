@@ -142,11 +142,12 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
     tries = []
     for c in rivals:
-        again = partial(refit_with, fit, [c], s.steps, seed)
-        tries.append((c, steps("refit", f"refitting with {c.effect.name}", f"turn{number}_refit_{c.effect.name}", again)))
+        refit = partial(refit_with, fit, [c], s.steps, seed)
+        again = steps("refit", f"refitting with {c.effect.name}", f"turn{number}_refit_{c.effect.name}", refit)
+        tries.append((c, again, log_likelihood(again, split.select)))
     weight = len(split.fit) / tested  # of a prediction for the tested spots
-    tries.sort(key=lambda t: -float(log_likelihood(t[1], split.select).sum()) - weight * t[0].gain)
-    finalists = [(c, again.extension) for k, (c, again) in enumerate(tries) if k < s.finalists or c is promising[0]]
+    tries.sort(key=lambda t: -float(t[2].sum()) - weight * t[0].gain)
+    finalists = [(c, again.extension) for k, (c, again, _) in enumerate(tries) if k < s.finalists or c is promising[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
@@ -158,14 +159,10 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
         jobs.append((text, name, partial(_rebuilt, rebuild, extension, seed)))
     control, *rebuilt = steps.several("fit", jobs, s.processes)
     controls.append(control)
-    tries += [(c, again) for (c, _), again in zip(finalists, rebuilt, strict=True) if again is not None]
+    pairs = zip(finalists, rebuilt, strict=True)
+    tries += [(c, again, log_likelihood(again, split.select)) for (c, _), again in pairs if again is not None]
     reference, block = best_likelihood(controls, split), split.block[split.select]
-
-    def trial(candidate: Candidate, again: SurfelFit) -> Trial:
-        likelihood = log_likelihood(again, split.select)
-        return Trial(candidate, again, compare(reference, likelihood, block), likelihood, weight * candidate.gain)
-
-    trials = best_of_each([trial(c, again) for c, again in tries])
+    trials = best_of_each([Trial(c, again, compare(reference, value, block), value, weight * c.gain) for c, again, value in tries])
     share = len(split.select) / tested
     held = [t for t in trials if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over))]
     if not held:
