@@ -10,8 +10,9 @@ from functools import partial
 import numpy as np
 import torch
 
-from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies
-from nlos_lit.criticism.joint_step import copy_effects
+from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies, smooth
+from nlos_lit.criticism.form import Form, form_of
+from nlos_lit.criticism.joint_step import copy_effects, null_of
 from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.rivals import Trial, best_of_each, choose, group_of
@@ -20,7 +21,7 @@ from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import Split
 from nlos_lit.criticism.steps import Steps
 from nlos_lit.effects import EFFECTS
-from nlos_lit.effects.base import Effect, Extension
+from nlos_lit.effects.base import Extension
 from nlos_lit.effects.scan import Scan
 from nlos_lit.errors import UserError
 from nlos_lit.surfel_fit import SurfelFit
@@ -71,7 +72,10 @@ class CriticismSettings:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without another effect."""
+    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without another effect.
+
+    ``form``: of the effect that was accepted before, where it is wrong.
+    """
 
     candidates: list[Candidate]
     discrepancies: list[Discrepancy]
@@ -79,6 +83,7 @@ class Turn:
     accepted: Trial | None
     group: list[str]
     controls: list[SurfelFit | None] = field(default_factory=list)
+    form: Form | None = None
 
 
 def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
@@ -101,23 +106,32 @@ def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[
 
 @dataclass(frozen=True)
 class Look:
-    """Effects and flexible discrepancies as the score tests see them; ``own`` ``[P]``: the step that the base alone would take."""
+    """Effects and flexible discrepancies as the score tests see them.
+
+    ``own`` ``[P]``: the step that the base alone would take. ``form``: of the effect asked about, where it is wrong.
+    """
 
     candidates: list[Candidate]
     discrepancies: list[Discrepancy]
     own: torch.Tensor
+    form: Form | None = None
 
 
-def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int) -> Look:
-    """Screen all effects that the fit does not have yet, and the flexible discrepancies."""
+def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, latest: str = "") -> Look:
+    """Screen all effects that the fit does not have yet, and the flexible discrepancies; look at the form of ``latest``."""
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
-    candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
-    return Look(candidates, discrepancies(problem, projector, scan), projector.own)
+    new = [e(scan) for e in EFFECTS if e.name not in have]
+    form = next((form_of(problem, projector, e) for e in fit.extension.effects if e.name == latest), None)
+    candidates = screen(problem, projector, new, folds)
+    rest = discrepancies(problem, projector, scan, [e for e in new if e.per_spot])
+    return Look(candidates, rest, projector.own, form if form is not None and form.wrong else None)
 
 
-def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps) -> Turn:
+def turn(
+    fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: CriticismSettings, seed: int, steps: Steps, latest: str = ""
+) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
     Rivals are the wanted effects, and those that promise more but are too like the base to be wanted by themselves.
@@ -127,11 +141,14 @@ def turn(fit: SurfelFit, rebuild: Rebuild, split: Split, scan: Scan, s: Criticis
     """
     number = len(fit.extension.effects) + 1
     steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
-    seen = steps("screen", f"screening effects, turn {number}", f"turn{number}_screen", lambda: look(fit, split, scan, s, seed))
+    screening = partial(look, fit, split, scan, s, seed, latest)
+    seen = steps("screen", f"screening effects, turn {number}", f"turn{number}_screen", screening)
     candidates, rest = seen.candidates, seen.discrepancies
+    if seen.form is not None:
+        return Turn(candidates, rest, [], None, [], form=seen.form)
     (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
-    wanted = significant(candidates, s, over)
+    wanted = [c for c in significant(candidates, s, over) if not (c.effect.per_spot and smooth(rest, c.effect.name, c.gain))]
     far_off = misfit > s.far_off * noise
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
@@ -186,14 +203,6 @@ def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
     return max(found, key=lambda values: float(values.sum()))
 
 
-def null_of(effect: Effect) -> Effect:
-    """A copy at its null, at the shape that was found best."""
-    copy = type(effect)(effect.scan)
-    for p in copy.shapes:
-        copy.set(p.name, effect.value(p.name).detach())
-    return copy
-
-
 def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
     """Nats over the tested spots that an effect must gain, ``over`` being the misfit there.
 
@@ -238,7 +247,12 @@ class Findings:
     @property
     def left(self) -> list[Discrepancy]:
         """Flexible discrepancies of the final fit."""
-        return self.turns[-1].discrepancies
+        return self.turns[-1 if self.wrong is None else -2].discrepancies
+
+    @property
+    def wrong(self) -> Form | None:
+        """Form of the effect that was accepted last, and not kept because of it."""
+        return self.turns[-1].form
 
 
 def criticise(
@@ -252,16 +266,19 @@ def criticise(
             imitated an effect do not come back.
         steps: says and keeps what is done.
     """
-    fit, turns, steps = base, [], steps or Steps()
+    fit = before = base
+    turns, latest, steps = [], "", steps or Steps()
     while True:
-        turns.append(turn(fit, rebuild, split, scan, s, seed, steps))
+        turns.append(turn(fit, rebuild, split, scan, s, seed, steps, latest))
         best = turns[-1].accepted
         if best is None:
             break
-        fit = best.fit
+        before, fit, latest = fit, best.fit, best.name
         if len(fit.extension.effects) == s.most:
-            last = steps("screen", "screening what is left", "last_screen", partial(look, fit, split, scan, s, seed))
-            turns.append(Turn(last.candidates, last.discrepancies, [], None, []))
+            last = steps("screen", "screening what is left", "last_screen", partial(look, fit, split, scan, s, seed, latest))
+            turns.append(Turn(last.candidates, last.discrepancies, [], None, [], form=last.form))
             break
+    if turns[-1].form is not None:
+        fit = before
     fit = drop_needless(fit, split, s.steps, seed, steps)
     return Findings(base, fit, turns)

@@ -80,6 +80,12 @@ def assemble(
         names = ", ".join(t.accepted.name for t in found.accepted)
         notes.append(f"{names} improved the fit but left most of the misfit as it was, and is therefore not named")
         final = base
+    if found.wrong is not None:
+        form = found.wrong
+        notes.append(
+            f"{form.name} improved the fit, but would need another strength in every stretch of the {form.axis} axis "
+            f"({form.gain:.0f} nats, of {form.own:.0f} that it changes itself), and is therefore not named"
+        )
     fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
     return Diagnosis(
         effects=effects,
@@ -104,6 +110,8 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
     """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain."""
     rest = [d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain]
     worst = max(rest, key=lambda d: d.gain, default=None)
+    if worst is None and found.wrong is not None:
+        return Verdicts(Unexplained(True, found.wrong.axis, found.wrong.statistic, found.wrong.p_value), False)
     if worst is None:
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)

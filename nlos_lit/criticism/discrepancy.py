@@ -1,11 +1,14 @@
 """Flexible discrepancies: may say that something is wrong along an axis, never what (after Kennedy and O'Hagan, 2001).
 
-Each axis has its own columns: the expected counts (time, rate) or the signal (wall, scan) within one band of the axis. They are
-tested like effects, projected off the base and all accepted effects, and cross-validated over random spots.
+Each axis has its own columns: the expected counts within one band of the axis. Along wall and scan there is one more set for every
+effect with one random number a spot: that number, the same within a band. So an object that moves during the scan shows as a delay
+that is smooth along it, and not as jitter. All are tested like effects, projected off the base and all accepted effects, and
+cross-validated over random spots.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,26 +17,39 @@ from scipy import stats
 from torch import Tensor
 
 from nlos_lit.criticism.screen import FOLDS, Projector
-from nlos_lit.criticism.sensitivity import Problem
+from nlos_lit.criticism.sensitivity import Problem, weighted_columns
+from nlos_lit.effects.base import Effect
 from nlos_lit.effects.scan import Scan
 
 BANDS = {"time": 40, "wall": 8, "scan": 64, "rate": 10}
+SMOOTH = 0.5  # share of a per-spot effect's gain that neighbours have in common, from which on its numbers are not independent
 
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """``gain`` nats (cross-validated); ``statistic`` of ``degrees`` columns."""
+    """``gain`` nats (cross-validated); ``statistic`` of ``degrees`` columns; ``of``: the per-spot effect smoothed, or ""."""
 
     axis: str
     gain: float
     statistic: float
     degrees: int
     p_value: float
+    of: str = ""
 
 
-def discrepancies(problem: Problem, projector: Projector, scan: Scan) -> list[Discrepancy]:
-    """One for each axis, the largest gain first."""
-    return sorted((_test(problem, projector, axis, scan) for axis in BANDS), key=lambda d: -d.gain)
+def discrepancies(problem: Problem, projector: Projector, scan: Scan, per_spot: Sequence[Effect] = ()) -> list[Discrepancy]:
+    """One for each axis, and two for each per-spot effect; the largest gain first."""
+    root = problem.expected.sqrt()
+    found = [_test(root, problem, projector, axis, scan) for axis in BANDS]
+    for effect in per_spot:
+        column = weighted_columns(problem, effect)[:, 0].view(root.shape)
+        found += [_test(column, problem, projector, axis, scan, effect.name) for axis in ("scan", "wall")]
+    return sorted(found, key=lambda d: -d.gain)
+
+
+def smooth(found: list[Discrepancy], name: str, gain: float) -> bool:
+    """Whether neighbours share most of what a per-spot effect gains (nats), so that its numbers are not independent."""
+    return any(d.of == name and d.gain > SMOOTH * gain for d in found)
 
 
 def bands(problem: Problem, axis: str, scan: Scan) -> Tensor:
@@ -50,14 +66,17 @@ def bands(problem: Problem, axis: str, scan: Scan) -> Tensor:
     return torch.argsort(torch.argsort(total)) * number // len(total)
 
 
-def _test(problem: Problem, projector: Projector, axis: str, scan: Scan) -> Discrepancy:
-    band = bands(problem, axis, scan)
-    names, band = torch.unique(band, return_inverse=True)
-    k = len(names)
-    spots, bins = problem.expected.shape
-    onehot = torch.nn.functional.one_hot(band, k).float()
-    root = problem.expected.sqrt()
-    columns = root[:, :, None] * (onehot[None] if axis == "time" else onehot[:, None])
+def _test(column: Tensor, problem: Problem, projector: Projector, axis: str, scan: Scan, of: str = "") -> Discrepancy:
+    """``column`` ``[S, T]``, with a coefficient of its own in every band of the axis."""
+    names, band = torch.unique(bands(problem, axis, scan), return_inverse=True)
+    onehot = torch.nn.functional.one_hot(band, len(names)).float()
+    gain, statistic, p = flexible(column[:, :, None] * (onehot[None] if axis == "time" else onehot[:, None]), problem, projector)
+    return Discrepancy(axis, gain, statistic, len(names), p, of)
+
+
+def flexible(columns: Tensor, problem: Problem, projector: Projector) -> tuple[float, float, float]:
+    """Gain (nats, cross-validated over random spots), statistic and p-value of weighted columns ``[S, T, k]``."""
+    spots, bins, k = columns.shape
     z = projector.off(columns.reshape(-1, k)).view(spots, bins, k)
     folds = torch.from_numpy(np.random.default_rng(1).permutation(spots) % FOLDS)
     score = torch.einsum("sbk,sb->sk", z, projector.residual.view(spots, bins)).double()
@@ -70,4 +89,4 @@ def _test(problem: Problem, projector: Projector, axis: str, scan: Scan) -> Disc
         step = torch.linalg.solve(total - f[b] + floor, s.sum(0) - s[b])
         gain += float(step @ s[b] - 0.5 * step @ f[b] @ step)
     statistic = float(s.sum(0) @ torch.linalg.solve(total + floor, s.sum(0)))
-    return Discrepancy(axis, gain, statistic, k, float(stats.chi2.sf(statistic, k)))
+    return gain, statistic, float(stats.chi2.sf(statistic, k))

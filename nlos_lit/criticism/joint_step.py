@@ -84,6 +84,14 @@ def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
     return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
 
 
+def null_of(effect: Effect) -> Effect:
+    """A copy at its null, at the shape that it has."""
+    copied = type(effect)(effect.scan)
+    for p in copied.shapes:
+        copied.set(p.name, effect.value(p.name).detach())
+    return copied
+
+
 def _likelihood(fit: SurfelFit, rows: Tensor) -> float:
     counts = fit.counts[rows]
     expected = fit.model.expected(fit.train[rows], fit.extension).clamp_min(1e-9)

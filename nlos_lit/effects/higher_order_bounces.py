@@ -115,8 +115,9 @@ def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
     share = share / share.sum(0)
     away = centre[None] - centre[:, None]
     leaving = (away * normal[:, None]).sum(2).clamp_min(0)
-    # The unit keeps the distance of a surfel from itself differentiable; both its cosines are 0.
-    square = away.square().sum(2) + torch.eye(len(chosen), dtype=centre.dtype, device=centre.device)
+    square = away.square().sum(2)
+    # Ones keep the distance of a surfel from itself, and from one in the same place, differentiable; both cosines are 0.
+    square = square + (square == 0)
     exchange = leaving * leaving.T / (square * (square + (area[:, None] + area) / (2 * math.pi)))
     total = share.T @ exchange @ share
     distance = share.T @ (exchange * torch.sqrt(square)) @ share

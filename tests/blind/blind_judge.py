@@ -20,7 +20,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.criticism.base import BasePipeline
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, best_likelihood
 from nlos_lit.criticism.joint_step import copy_effects
-from nlos_lit.criticism.refit import log_likelihood, refit_with
+from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with
 from nlos_lit.criticism.result import Diagnosis
 from nlos_lit.criticism.run import diagnose
 from nlos_lit.criticism.split import split_spots
@@ -35,7 +35,8 @@ class Outcome:
 
     Args:
         named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control on spots that neither
-            fitted, scaled to the number of fitted spots. gain, oracle: nats on the select spots.
+            fitted, scaled to the number of fitted spots; statistic_error: its standard error, by bootstrap over wall blocks.
+        gain, oracle: nats on the select spots.
         errors: per true quantity, (found - true)/stderr and found/true - 1.
         screened: the six best of the first screening: name, statistic, predicted gain (nats), retained information.
     """
@@ -50,6 +51,7 @@ class Outcome:
     statistic: float
     gain: float
     oracle: float
+    statistic_error: float = 0.0
     errors: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     values: dict[str, dict[str, float]] = field(default_factory=dict)
     found: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
@@ -94,12 +96,12 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         truth = make_capture(spec, path)
         diagnosis, found, capture = diagnose_file(path, options)
     split = split_spots(capture)
-    gain = best = 0.0
+    gain, best, weight = 0.0, Comparison(0.0, 0.0, (0.0, 0.0)), len(split.fit) / len(split.select)
     if diagnosis.effects or (oracle and truth.names):
         controls = found.turns[0].controls or [found.base, refit_with(found.base, [], options.steps, 0)]
         before = best_likelihood(controls, split)
         gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
-        best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else 0.0
+        best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else best
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,
@@ -108,9 +110,10 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         named=[e.name for e in diagnosis.effects],
         groups=diagnosis.groups,
         unexplained=diagnosis.unexplained.axis if diagnosis.unexplained.significant else "",
-        statistic=2 * best * len(split.fit) / len(split.select),
+        statistic=2 * best.nats * weight,
         gain=gain,
-        oracle=best,
+        oracle=best.nats,
+        statistic_error=2 * best.error * weight,
         errors=parameter_errors(truth, diagnosis),
         values=truth.values,
         found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
@@ -120,14 +123,15 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
     )
 
 
-def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor) -> float:
+def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor) -> Comparison:
     """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
     warm = refit_with(found.base, candidates, options.steps, 0)
     pipeline = pipeline_for(capture)
     anew = pipeline.fit(capture, split, pipeline.image(capture), copy_effects(warm.extension, []), 0)
-    return max(float((log_likelihood(f, split.select) - before).sum()) for f in (warm, anew))
+    block = split.block[split.select]
+    return max((compare(before, log_likelihood(f, split.select), block) for f in (warm, anew)), key=lambda gain: gain.nats)
 
 
 def parameter_errors(truth: Truth, diagnosis: Diagnosis) -> dict[str, dict[str, tuple[float, float]]]:

@@ -27,10 +27,10 @@ from nlos_lit.criticism.criticise import (
     criticise,
     group_of,
     needed,
-    null_of,
     significant,
 )
-from nlos_lit.criticism.joint_step import set_step
+from nlos_lit.criticism.form import Form
+from nlos_lit.criticism.joint_step import null_of, set_step
 from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.screen import Candidate
@@ -249,7 +249,7 @@ def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
     names = ["irf_tail", "pile_up", "vignetting", "gate_edges"]
     rest = [SimpleNamespace(axis="time")]
 
-    def turn(fit, rebuild, split, scan, s, seed, steps) -> Turn:
+    def turn(fit, rebuild, split, scan, s, seed, steps, latest) -> Turn:
         k = len(fit.extension.effects)
         if k == len(accepting):
             return Turn([], [], [], None, [])
@@ -273,3 +273,30 @@ def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
     assert isinstance(found, Findings)
     assert found.accepted == []
     assert len(found.turns) == 1
+
+
+def test_an_effect_of_the_wrong_form_is_taken_back(monkeypatch):
+    """The tail stays, the ripple after it goes, and what is left is what was left before the ripple."""
+    wrong = Form("tcspc_nonlinearity", 900.0, 1000.0, 1800.0, 0.0)
+    names = ["irf_tail", "tcspc_nonlinearity"]
+    asked = []
+
+    def turn(fit, rebuild, split, scan, s, seed, steps, latest) -> Turn:
+        asked.append(latest)
+        k = len(fit.extension.effects)
+        if k == 2:
+            return Turn([], ["after the ripple"], [], None, [], form=wrong)
+        accepted = Trial(candidate(names[k]), FakeFit(tuple(names[: k + 1])), Comparison(9, 1, (7, 11)), torch.zeros(120))
+        return Turn([], [f"with {k} effects"], [accepted], accepted, [])
+
+    monkeypatch.setattr(loop, "turn", turn)
+    monkeypatch.setattr(loop, "drop_needless", lambda fit, *_: fit)
+    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(), 0)
+    assert asked == ["", *names]
+    assert [t.accepted.name for t in found.accepted] == ["irf_tail"]
+    assert found.left == ["with 1 effects"]
+    assert found.wrong is wrong
+    # The last that may be accepted is looked at just so.
+    monkeypatch.setattr(loop, "look", lambda *_: Look([], ["after the ripple"], None, wrong))
+    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(most=2), 0)
+    assert ([t.accepted.name for t in found.accepted], found.left) == (["irf_tail"], ["with 1 effects"])

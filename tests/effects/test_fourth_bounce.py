@@ -136,3 +136,15 @@ def test_share_is_known_after_a_rendering():
     # All light of this scene falls into the record, but for the tail of the response.
     assert (more.sum() / plain.sum() - 1).item() == pytest.approx(share, rel=0.1)
     assert share > 1e-4
+
+
+def test_surfels_in_the_same_place_keep_it_finite():
+    capture, model = valley(True, 4)
+    centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
+    model.place(centre[[0, 0, *range(1, len(centre))]], normal[[0, 5, *range(1, len(normal))]], albedo[[0, *range(len(albedo))]])
+    spots = torch.arange(capture.n_spots)
+    paths = model.paths(spots)
+    effect = HigherOrderBounces(Scan.of(capture))
+    effect.fourth_bounce(paths.contribution * model.albedo()[:, None], paths, spots, N_BINS).sum().backward()
+    for parameter in (model.raw_depth, model.raw_normal, model.raw_albedo):
+        assert parameter.grad.isfinite().all()

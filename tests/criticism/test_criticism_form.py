@@ -1,0 +1,94 @@
+"""Whether what an effect explains has that effect's form."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, raster, surfels
+
+from nlos_lit.criticism.discrepancy import discrepancies, smooth
+from nlos_lit.criticism.form import Form, form_of
+from nlos_lit.criticism.screen import Projector, screen
+from nlos_lit.criticism.sensitivity import build_problem
+from nlos_lit.effects import Effect, Extension, Scan
+
+pytestmark = FORWARD_MODE
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return capture_of(raster(20))
+
+
+def problem_with(scene, inside: list[Effect], measured: list[Effect], factor: torch.Tensor | float = 1.0):
+    """Counts with the effects ``measured``, times ``factor``, against a model with the effects ``inside``."""
+    model, spots = surfels(scene), torch.arange(scene.n_spots)
+    counts = torch.from_numpy(drawn(model, Extension(measured), scene, 3, factor).gated_counts())
+    problem = build_problem(model, Extension(inside), spots, counts)
+    return problem, Projector(problem)
+
+
+def form(scene, effect: Effect, measured: list[Effect], factor: torch.Tensor | float = 1.0) -> Form | None:
+    problem, projector = problem_with(scene, [effect], measured, factor)
+    return form_of(problem, projector, effect)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("irf_tail", {"fraction": 0.2, "decay": 0.2}),
+        ("tcspc_nonlinearity", {"sine": 0.3, "period": 9.0}),
+        ("vignetting", {"strength": 0.4}),
+    ],
+)
+def test_a_true_effect_has_its_form(scene, name, values):
+    effect = effect_of(name, Scan.of(scene), **values)
+    found = form(scene, effect, [effect])
+    assert not found.wrong
+    assert abs(found.gain) < 10
+    assert found.own > 100
+    assert found.p_value > 1e-3
+
+
+def test_own_is_half_the_squared_change(scene):
+    effect = effect_of("vignetting", Scan.of(scene), strength=0.4)
+    model, spots = surfels(scene), torch.arange(scene.n_spots)
+    with_, without = (model.expected(spots, Extension(e)).double() for e in ([effect], []))
+    found = form(scene, effect, [effect])
+    assert found.own == pytest.approx(float(((with_ - without) ** 2 / with_).sum()) / 2, rel=1e-4)
+
+
+def test_a_ripple_that_stands_for_a_gap_has_not(scene):
+    """Five codes lose 60 %; of all ripples with half a period there, the one with the best strength is in the model."""
+    factor = torch.ones(scene.n_spots, scene.gate[1] - scene.gate[0])
+    factor[:, 20:25] = 0.4
+    scan = Scan.of(scene)
+    problem, projector = problem_with(scene, [], [], factor)
+    ripple = effect_of("tcspc_nonlinearity", scan)
+    found = screen(problem, projector, [ripple], torch.arange(scene.n_spots) % 6)[0]
+    assert found.gain > 100, "it is tempting"
+    ripple.set("sine", 0.02 * float(found.step[0]))
+    ripple.set("cosine", 0.02 * float(found.step[1]))
+    shape = form(scene, ripple, [], factor)
+    assert shape.wrong
+    assert shape.gain > shape.own
+    assert shape.axis == "time"
+
+
+def test_a_number_for_every_spot_has_no_common_strength(scene):
+    assert form(scene, effect_of("timing_jitter", Scan.of(scene)), []) is None
+
+
+def test_a_delay_that_neighbours_share_is_no_jitter(scene):
+    """An offset that jumps in the middle of the scan, and one drawn for every spot alone."""
+    scan = Scan.of(scene)
+    own = torch.randn(scene.n_spots, generator=torch.Generator().manual_seed(1))
+    for offset, shared in ((torch.where(scan.rank < 0, -1.0, 1.0), True), (own, False)):
+        moved = effect_of("timing_jitter", scan, offset=0.015 * offset)
+        problem, projector = problem_with(scene, [], [moved])
+        jitter = effect_of("timing_jitter", scan)
+        gain = screen(problem, projector, [jitter], torch.arange(scene.n_spots) % 6)[0].gain
+        assert gain > 100
+        found = discrepancies(problem, projector, scan, [jitter])
+        assert smooth(found, "timing_jitter", gain) is shared
+        assert (found[0].of, found[0].axis) == ("timing_jitter", "scan") if shared else not smooth(found, "hot_spots", gain)
