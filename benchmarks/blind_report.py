@@ -33,6 +33,17 @@ def group(case: dict, name: str) -> list[str]:
     return next((g for g in case["groups"] if g[0] == name), [name])
 
 
+def error(case: dict) -> float:
+    """Of the true statistic; a tenth of it for outcomes that were stored before it was worked out."""
+    return case.get("statistic_error", 0.1 * case["statistic"])
+
+
+def true_statistic(case: dict) -> str:
+    if not case["hidden"]:
+        return ""
+    return f"{case['statistic']:.0f}" + (f" ± {case['statistic_error']:.0f}" if "statistic_error" in case else "")
+
+
 def first_right(case: dict) -> bool:
     return bool(case["named"]) and any(n in case["hidden"] for n in group(case, case["named"][0]))
 
@@ -53,6 +64,7 @@ def rows(cases: list[dict]) -> list[tuple[str, str, str]]:
         by[kind(case)].append(case)
     seen = [c for c in by["single"] if c["statistic"] > STRONG]
     weak = [c for c in by["single"] if c["statistic"] <= STRONG]
+    sure = [c for c in seen if c["statistic"] - 2 * error(c) > STRONG]
     alone = [c for c in seen if c["named"] and c["named"][0] in c["hidden"]]
     right = [c for c in seen if first_right(c)]
     checks = [ok for c in alone for ok in parameters_right(c)]
@@ -63,6 +75,7 @@ def rows(cases: list[dict]) -> list[tuple[str, str, str]]:
     share = f"; median share {np.median(shares):.0%}, of all nats {_total(seen):.0%}" if shares else ""
     return [
         ("hidden effect named first, alone or in its group (true statistic > 50)", "≥ 95 %", interval(len(right), len(seen))),
+        ("… where it exceeds 50 by two of its standard errors", "", interval(sum(map(first_right, sure)), len(sure))),
         ("… named first itself", "", interval(len(alone), len(seen))),
         ("the same below a true statistic of 50", "", interval(sum(map(first_right, weak)), len(weak))),
         ("false alarms on effect-free captures", "≤ 5 %", interval(sum(bool(c["named"]) for c in by["null"]), len(by["null"]))),
@@ -97,7 +110,7 @@ def line(name: str, case: dict) -> str:
     said = ", ".join("/".join(group(case, n)) for n in case["named"]) or "–"
     wrong = "; ".join(f"{q} {s:+.1f} σ, {r:+.0%}" for found in case["errors"].values() for q, (s, r) in found.items())
     cells = (
-        case["spec"]["scene"], f"{case['spec']['level']:g}", hidden or "nothing", f"{case['statistic']:.0f}" if hidden else "",
+        case["spec"]["scene"], f"{case['spec']['level']:g}", hidden or "nothing", true_statistic(case),
         said, case["unexplained"] or "–", f"{case['gain']:.0f}/{case['oracle']:.0f}" if hidden else "", wrong,
         f"{case['ratio']:.3f}", f"{case['seconds']:.0f}",
     )  # fmt: skip

@@ -148,11 +148,12 @@ def turn(
         return Turn(candidates, rest, [], None, [], form=seen.form)
     (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
     over = misfit * tested / len(split.fit)
-    wanted = [c for c in significant(candidates, s, over) if not (c.effect.per_spot and smooth(rest, c.effect.name, c.gain))]
+    possible = [c for c in candidates if not smooth(rest, c.effect.name, c.gain)]
+    wanted = significant(possible, s, over)
     far_off = misfit > s.far_off * noise
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
-    promising = [c for c in candidates if c in wanted or (wanted and c.p_value < s.level and c.gain > wanted[0].gain)]
+    promising = [c for c in possible if c in wanted or (wanted and c.p_value < s.level and c.gain > wanted[0].gain)]
     rivals = [c for c in promising[: s.rivals] if c.gain > s.hopeless * promising[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
     own = partial(refit_with, fit, [], s.steps, seed, seen.own)

@@ -48,7 +48,7 @@ def discrepancies(problem: Problem, projector: Projector, scan: Scan, per_spot: 
 
 
 def smooth(found: list[Discrepancy], name: str, gain: float) -> bool:
-    """Whether neighbours share most of what a per-spot effect gains (nats), so that its numbers are not independent."""
+    """Whether neighbours share much of what a per-spot effect gains (nats), so that its numbers are not independent."""
     return any(d.of == name and d.gain > SMOOTH * gain for d in found)
 
 

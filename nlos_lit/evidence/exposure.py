@@ -59,7 +59,7 @@ def figure7(work: Workspace, size: Size) -> Evidence:
                 row |= {"held-out NMSE": held["nmse"], "NMSE of noise": held["floor"]}
             rows.append(row)
     names = [BY_HAND, "fk", "rsd", "published system", "ours, phasor surface", "ours, refined"]
-    grid = [[plots.Image(found[name]) if name in found else None for name in names] for found in fronts.values()]
+    grid = [[plots.Image(found[name]) for name in names] for found in fronts.values()]
     sweep = [[plots.Image(found[n]) for n in found if n.startswith("lct ")] for found in fronts.values()]
     ends = [scene.extent] * len(size.minutes)
     labels = [f"{minutes} min" for minutes in size.minutes]
@@ -99,8 +99,8 @@ def consensus(fronts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 def _exposure(work: Workspace, size: Size, minutes: int) -> tuple[dict[str, np.ndarray], dict[str, Any], Scene]:
     subject = exposed(work, size, minutes)
     scene = work.open(subject)
-    ends = minutes in (size.minutes[0], size.minutes[-1])
-    ours = work.train(subject.name, subject, f"refine={str(ends).lower()}")
+    ours = work.train(subject.name, subject, "refine=true")
+    paper = work.train(f"{subject.name}_paper", subject, "model=paper")
 
     def classical() -> dict[str, Any]:
         volumes = {f"lct {snr:g}": ("lct", {"snr": snr, "falloff": scene.falloff}) for snr in size.snrs}
@@ -109,16 +109,15 @@ def _exposure(work: Workspace, size: Size, minutes: int) -> tuple[dict[str, np.n
 
     fronts = dict(work.kept(f"figure7/{subject.name}", classical))
     fronts["ours, phasor surface"] = read_volume(ours / "volume.h5")[0].max(0)
-    found = summary(ours)
+    fronts["ours, refined"] = front_of_points(run_points(ours, refined=True), scene.grid.x, scene.grid.y)
+    fronts["published system"] = read_volume(paper / "volume.h5")[0].max(0)
+    found, other = summary(ours), summary(paper)["heldout"]["nmse"]
     held = found["heldout"]["nmse"]
-    scores = {"ours, phasor surface": {"nmse": held["final"], "floor": held["noise_floor"]}}
-    if ends:
-        fronts["ours, refined"] = front_of_points(run_points(ours, refined=True), scene.grid.x, scene.grid.y)
-        scores["ours, refined"] = {"nmse": found["refined"]["heldout"]["nmse"], "floor": held["noise_floor"]}
-        paper = work.train(f"{subject.name}_paper", subject, "model=paper")
-        fronts["published system"] = read_volume(paper / "volume.h5")[0].max(0)
-        other = summary(paper)["heldout"]["nmse"]
-        scores["published system"] = {"nmse": other["final"], "floor": other["noise_floor"]}
+    scores = {
+        "ours, phasor surface": {"nmse": held["final"], "floor": held["noise_floor"]},
+        "ours, refined": {"nmse": found["refined"]["heldout"]["nmse"], "floor": held["noise_floor"]},
+        "published system": {"nmse": other["final"], "floor": other["noise_floor"]},
+    }
     return fronts, scores, scene
 
 

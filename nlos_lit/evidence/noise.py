@@ -35,7 +35,7 @@ def signal_to_noise(scene: Scene) -> float:
 def figure6(work: Workspace, size: Size) -> Evidence:
     """Errors of the surface against the counts of a spot, for all systems."""
     rows: list[Row] = []
-    maps: list[list[plots.Image | None]] = []
+    maps: list[list[plots.Image]] = []
     levels = []
     for counts in size.counts:
         subject = noisy_bunny(work, size, counts)
@@ -45,8 +45,8 @@ def figure6(work: Workspace, size: Size) -> Evidence:
         levels.append(f"{counts} counts\n{noise:.1f} dB")
         rows += [{"counts a spot": counts, "SNR (dB)": noise, "system": name, **_row(entry)} for name, entry in found.items()]
         limits = tuple(np.nanquantile(scene.truth.depth, (0.01, 0.99)))
-        shown = [found.get(name) for name in (*METHODS, *OURS)]
-        maps.append([None if entry is None else plots.Image(entry["depth"], "depth", limits) for entry in shown])
+        shown = [found[name] for name in (*METHODS, *OURS)]
+        maps.append([plots.Image(entry["depth"], "depth", limits) for entry in shown])
     names = [*METHODS, *OURS]
     panels = [
         plots.Panel(
@@ -84,9 +84,10 @@ def _curve(rows: list[Row], name: str, what: str) -> tuple[list[float], list[flo
 
 
 def _level(work: Workspace, size: Size, subject: Subject, scene: Scene) -> dict[str, Arrays]:
-    runs = {"ours": work.train(subject.name, subject, "refine=true")}
-    if subject.name in (f"bunny_{size.counts[0]}", f"bunny_{size.counts[-1]}"):
-        runs["paper"] = work.train(f"{subject.name}_paper", subject, "model=paper")
+    runs = {
+        "ours": work.train(subject.name, subject, "refine=true"),
+        "paper": work.train(f"{subject.name}_paper", subject, "model=paper"),
+    }
 
     def entry(points: Points, chosen: dict[str, float]) -> dict[str, Any]:
         errors = {f"row_{key}": value for key, value in geometry_row(errors_of(points, scene)).items()}
@@ -95,7 +96,7 @@ def _level(work: Workspace, size: Size, subject: Subject, scene: Scene) -> dict[
     found = {}
     for name in METHODS:
         found[name] = work.kept(f"figure6/{subject.name}_{name}", lambda m=name: entry(*classical_points(scene, m, size.snrs)))
-    found |= {name: entry(take(runs[run], scene), {}) for name, (run, take) in OURS.items() if run in runs}
+    found |= {name: entry(take(runs[run], scene), {}) for name, (run, take) in OURS.items()}
     return found
 
 

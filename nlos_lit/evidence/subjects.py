@@ -58,7 +58,7 @@ class Size:
 
 SIZES = {
     "full": Size(
-        name="full", experiment="evidence", real=True, seeds=(0, 1, 2), counts=(50, 800, 12800),
+        name="full", experiment="evidence", real=True, seeds=(0, 1, 2), counts=(50, 200, 800, 3200, 12800),
         minutes=(10, 30, 60, 180), steps=(0, 10, 50, 100), snrs=(0.001, 0.01, 0.1, 1.0, 10.0),
         effects=(("vignetting", "ambient_map"),), samples=20_000,
     ),
