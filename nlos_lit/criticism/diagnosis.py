@@ -10,6 +10,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_rows, tested_spots
+from nlos_lit.criticism.discrepancy import Discrepancy
 from nlos_lit.criticism.estimate import Uncertainty
 from nlos_lit.criticism.refit import score
 from nlos_lit.criticism.residuals import profiles
@@ -115,10 +116,24 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
     if worst is None:
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
+    return Verdicts(Unexplained(True, worst.axis, worst.statistic, worst.p_value), _outweighs(worst, found, split, settings))
+
+
+def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: CriticismSettings) -> bool:
+    """Whether names hold less than the share ``explained`` of the misfit: of all that they gain and is left, nats a spot; or, where
+    most of what they were predicted to gain was of this very kind, of what the base had of it.
+    """
+    if not found.accepted:
+        return False
+    tested = tested_spots(found.final, split, settings.spots)
+    spared = 1 - settings.explained
     named = sum(t.accepted.gain.nats for t in found.accepted) / len(split.select)
-    left = worst.gain / tested_spots(found.final, split, settings.spots)
-    dominates = bool(found.accepted) and named < settings.explained / (1 - settings.explained) * left
-    return Verdicts(Unexplained(True, worst.axis, worst.statistic, worst.p_value), dominates)
+    if spared * named < settings.explained * left.gain / tested:
+        return True
+    had = next((d.gain for d in found.turns[0].discrepancies if (d.axis, d.of) == (left.axis, left.of)), 0.0)
+    had *= tested / tested_spots(found.base, split, settings.spots)
+    predicted = sum(t.accepted.candidate.gain for t in found.accepted)
+    return had - left.gain > 0.5 * predicted and left.gain > spared * had
 
 
 def _accepted(turn: Turn, effect: Effect, uncertainty: Uncertainty, split: Split, null: Null | None) -> Accepted:

@@ -126,13 +126,16 @@ def test_errors_are_those_of_repeated_measurements():
     assert torch.all(steps.mean(0).abs() < 4 * error / 200**0.5)
 
 
-def findings(gains: list[float], left: list[Discrepancy]) -> Findings:
-    """Effects accepted with ``gains`` nats on 64 select spots, what is left, and a small fit."""
+def findings(gains: list[float], left: list[Discrepancy], had: list[Discrepancy] = (), predicted: float = 0.0) -> Findings:
+    """Effects accepted with ``gains`` nats on 64 select spots, what is left, and a small fit.
+
+    ``had``: what the base left. ``predicted``: nats, by each effect's screening.
+    """
     names = ["irf_tail", "pile_up"][: len(gains)]
     effects = [effect_of(n, SCAN) for n in names]
     final = SimpleNamespace(extension=Extension(effects), model=range(12), counts=torch.zeros(160, 58))
     turns = [
-        Turn([], [], [], Trial(Candidate(e, 0, 0, 0, 0, None, None, {}, None), None, Comparison(g, 1, (0, 0)), None), [])
+        Turn([], had, [], Trial(Candidate(e, 0, 0, 0, predicted, None, None, {}, None), None, Comparison(g, 1, (0, 0)), None), [])
         for e, g in zip(effects, gains, strict=True)
     ]
     return Findings(final, final, [*turns, Turn([], left, [], None, [])])
@@ -167,6 +170,19 @@ def test_names_fall_where_more_is_left_than_they_explain():
     assert judge(findings([32.0, 32.0], [discrepancy("time", 50)]), SPLIT, CriticismSettings(spots=80)).dominates
     # Names must explain three quarters: three times as much.
     assert judge(findings([32.0, 32.0], [discrepancy("time", 60)]), SPLIT, CriticismSettings(explained=0.75)).dominates
+
+
+def test_names_fall_where_they_leave_much_of_their_own_kind():
+    """Two effects, predicted to gain 100 nats each on 160 tested spots, that gained ten times as much as they left."""
+    left = [discrepancy("scan", 100), discrepancy("time", 40)]
+    for scan, dominates in ((270, True), (330, False), (180, False)):  # leave 37, 30 %; only 80 of 400 nats are of this kind
+        had = [discrepancy("time", 500), discrepancy("scan", scan)]
+        said = judge(findings([320.0, 320.0], left, had, 100.0 if scan > 200 else 200.0), SPLIT, CriticismSettings())
+        assert said.unexplained.axis == "scan"
+        assert said.dominates is dominates
+    # Delays that neighbours share are another kind than gains, on the same axis.
+    had = [Discrepancy("scan", 270, 540, 64, 0.0, "timing_jitter"), discrepancy("scan", 90)]
+    assert not judge(findings([320.0, 320.0], left, had, 100.0), SPLIT, CriticismSettings()).dominates
 
 
 def test_screened_in_units_of_the_parameters():
