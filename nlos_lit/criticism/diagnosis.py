@@ -79,7 +79,7 @@ def assemble(
     notes = []
     if verdicts.dominates:
         names = ", ".join(t.accepted.name for t in found.accepted)
-        notes.append(f"{names} improved the fit but left most of the misfit as it was, and is therefore not named")
+        notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
         final = base
     if found.wrong is not None:
         form = found.wrong

@@ -17,7 +17,7 @@ from nlos_lit.criticism.plots import by_gain, diagnosis_figures
 from nlos_lit.criticism.quantities import NONE, amount, number, percent, probability, quantity
 from nlos_lit.criticism.result import Accepted, Diagnosis
 from nlos_lit.criticism.style import CSS
-from nlos_lit.criticism.verdict import barely, invisible, misfit, rivals, sureness, tone, verdict
+from nlos_lit.criticism.verdict import barely, invisible, misfit, missing, rivals, sureness, tone, verdict
 from nlos_lit.criticism.words import AXES, describe
 from nlos_lit.export import whole_file, write_json
 from nlos_lit.figures import save_figure
@@ -82,8 +82,11 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         return "".join(image for name, image in images.items() if name.startswith(starts) and name not in set(extra))
 
     name = str(diagnosis.capture.get("name", "capture"))
+    several = missing(diagnosis) if len(missing(diagnosis)) > 1 else []
+    each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in several) + "</ol>" if several else ""
     parts = [
-        f'<header><p class="over">Diagnosis of {_text(name)}</p><h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis))}</h1>'
+        f'<header><p class="over">Diagnosis of {_text(name)}</p>'
+        f'<h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis, listed=False))}</h1>{each}'
         f"<p>{_text(sureness(diagnosis))}</p></header>",
         _misfit_bar(diagnosis),
         _section("What the simulation was extended with", _accepted(diagnosis)) if diagnosis.effects else "",

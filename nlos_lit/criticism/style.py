@@ -7,6 +7,7 @@ body { margin: 0 auto; padding: 1.2rem; max-width: 64rem; color: #1a1a1a; backgr
   font: 16px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
 h1 { margin: .2rem 0 .6rem; padding: .1rem 0 .1rem .9rem; font-size: 1.45rem; line-height: 1.3; border-left: .4rem solid; }
 h1.fine { border-color: #009E73; } h1.found { border-color: #0072B2; } h1.unexplained { border-color: #D55E00; }
+ol { padding-left: 1.6rem; } li { margin: .2rem 0; } header li { font-size: 1.1rem; }
 h2 { margin: 2.2rem 0 .6rem; font-size: 1.1rem; border-bottom: 1px solid var(--line); }
 small, figcaption, .over { color: var(--soft); font-size: .85rem; }
 .over { margin: 0; }

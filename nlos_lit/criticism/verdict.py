@@ -60,13 +60,19 @@ def tone(diagnosis: Diagnosis) -> str:
     return "found" if diagnosis.effects or diagnosis.groups else "fine"
 
 
-def verdict(diagnosis: Diagnosis) -> str:
-    """What is wrong, in plain words and one or two sentences."""
+def missing(diagnosis: Diagnosis) -> list[str]:
+    """What the simulation misses, in plain words, one entry for each effect and each group without an accepted one."""
     names = {effect.name for effect in diagnosis.effects}
     found = [_one(diagnosis, effect) for effect in diagnosis.effects]
     for group in diagnosis.groups:
         if not names & set(group):
             found.append(f"one of these, and this capture cannot tell which: {_either(group)}")
+    return found
+
+
+def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
+    """What is wrong, in plain words and one or two sentences; several things are only counted where they are not ``listed``."""
+    found = missing(diagnosis)
     axis = AXES.get(diagnosis.unexplained.axis, "on some axis")
     if not found:
         return (
@@ -77,7 +83,8 @@ def verdict(diagnosis: Diagnosis) -> str:
     if len(found) == 1:
         text = f"Your simulation misses {found[0]}"
     else:
-        text = f"Your simulation misses {len(found)} things: " + "; ".join(f"({k}) {one}" for k, one in enumerate(found, 1))
+        every = ": " + "; ".join(f"({k}) {one}" for k, one in enumerate(found, 1))
+        text = f"Your simulation misses {len(found)} things{every if listed else ''}"
     share = misfit(diagnosis).share
     if diagnosis.effects and share is not None:
         what = "it" if len(diagnosis.effects) == 1 else "them"

@@ -108,6 +108,13 @@ def test_verdicts():
     both = verdict(CASES["two"])
     assert both.startswith("Your simulation misses 2 things: (1) a slow detector tail")
     assert "41.3 ± 0.9 mrad along x" in both
+    assert verdict(CASES["two"], listed=False).startswith("Your simulation misses 2 things; modelling them explains")
+    page = report_html(CASES["two"], {})
+    head = page[page.index("<h1") : page.index("</header>")]
+    assert "mrad" not in head[: head.index("</h1>")]
+    assert head.count("<li>") == 2
+    assert "41.3 ± 0.9 mrad along x" in head
+    assert "<li>" not in report_html(two_found(effects=[TAIL], groups=[]), {}).split("</header>")[0]
     assert "(or a time zero that drifts during the scan: this capture cannot tell which); modelling them" in both
     group = verdict(diagnosis(groups=[["pile_up", "time_offset"]]))
     assert group.startswith("Your simulation misses one of these, and this capture cannot tell which: pile-up")
