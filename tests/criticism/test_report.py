@@ -164,7 +164,7 @@ def test_every_number_is_on_the_page(written):
             "1503.25",
             "seed 17",
             "toys 200",
-            "seconds 412.7",
+            "time taken (s) 412.7",
         ),
         *("[200, 512]", "raster", "letters <S&U>", "The splat's <width> was 0.62 bins."),
     ):
