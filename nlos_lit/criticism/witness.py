@@ -15,6 +15,7 @@ from nlos_lit.surfel_fit import SurfelFit
 
 LEAST = 20.0  # counts a spot before the gate that make a witness
 GAINS = ("wall_reflectance", "power_drift", "vignetting")
+SLOW = ("irf_tail", "afterpulsing")  # both follow the direct pulse, too, with the decay that they have inside the gate
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
@@ -37,8 +38,9 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         if capture.scan_shape is not None and len(capture.scan_shape) == 2:
             maps = {"direct": before / before.mean(), "fitted": np.exp(gain)}
             found["maps"] = {name: m.reshape(capture.scan_shape).tolist() for name, m in maps.items()}
-    if "irf_tail" in effects:
-        found["tail_decay_fitted_m"] = float(effects["irf_tail"].value("decay").detach())
+    slow = next((effects[name] for name in SLOW if name in effects), None)
+    if slow is not None:
+        found["tail_decay_fitted_m"] = float(slow.value("decay").detach())
         found["tail_decay_direct_m"] = direct_decays(capture)
     return found
 

@@ -126,6 +126,8 @@ def test_the_witness_knows_the_gain():
     assert found["direct_pulse_counts"] == pytest.approx(seen.counts[:, :160].sum() / 64)
     assert found["tail_decay_fitted_m"] == pytest.approx(0.2, rel=1e-3)
     assert found["tail_decay_direct_m"] == direct_decays(seen)
+    late = Extension([effect_of("afterpulsing", Scan.of(seen), probability=0.05, decay=0.3)])
+    assert witness(seen, SimpleNamespace(extension=late))["tail_decay_fitted_m"] == pytest.approx(0.3, rel=1e-3)
     maps = {name: np.array(m) for name, m in found["maps"].items()}
     assert maps["fitted"].shape == (8, 8)
     assert maps["direct"] / maps["direct"][3, 3] == pytest.approx(maps["fitted"] / maps["fitted"][3, 3], rel=1e-3)
