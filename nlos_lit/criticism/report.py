@@ -35,7 +35,12 @@ CAPTIONS = {
     "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted inside it.",
     "witness_tail": "The direct pulse's own decay against the tail that was fitted inside the gate.",
 }
-FACTS = {"bin_width_ps": "bin width (ps)", "bin_length": "bin length (m of path)", "gate": "gate (bins)", "counts_per_spot": "counts a spot"}
+FACTS = {
+    "bin_width_ps": "bin width (ps)",
+    "bin_length": "bin length (m of path)",
+    "gate": "gate (bins)",
+    "counts_per_spot": "counts a spot",
+}
 
 
 class Markup(str):
@@ -242,7 +247,8 @@ def _witness(diagnosis: Diagnosis) -> str:
 
 def _numerics(diagnosis: Diagnosis) -> str:
     rows = [[name.replace("_", " "), number(value)] for name, value in diagnosis.numerics.items()]
-    return "<p>What moves when only the computation is varied is not physics.</p>" + _table(["Varied", "Change of the deviance per bin (held-out spots)"], rows)
+    heads = ["Varied", "Change of the deviance per bin (held-out spots)"]
+    return "<p>What moves when only the computation is varied is not physics.</p>" + _table(heads, rows)
 
 
 def _facts(diagnosis: Diagnosis) -> str:

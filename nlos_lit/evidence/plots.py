@@ -53,7 +53,10 @@ def lines(panels: Sequence[Panel], columns: int = 3) -> Figure:
             handles[label] = axes.axhline(value, color=BLACK, linestyle=":", linewidth=0.9, label=label)
         axes.set(title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel)
         if panel.logx:
+            measured = sorted({value for x, _ in panel.series.values() for value in x})
             axes.set_xscale("log")
+            axes.set_xticks(measured, labels=[f"{value:g}" for value in measured])
+            axes.tick_params(axis="x", which="minor", bottom=False)
         if panel.logy:
             axes.set_yscale("log")
     for axes in drawn[len(panels) :]:

@@ -60,7 +60,7 @@ SIZES = {
     "full": Size(
         name="full", experiment="evidence", real=True, seeds=(0, 1, 2), counts=(50, 200, 800, 3200, 12800),
         minutes=(10, 30, 60, 180), steps=(0, 10, 50, 100), snrs=(0.001, 0.01, 0.1, 1.0, 10.0),
-        effects=(("vignetting", "ambient_map"),), samples=20_000,
+        effects=(("wall_reflectance", "ambient_map", "afterpulsing"),), samples=20_000,
     ),
     "reduced": Size(
         name="reduced", experiment="evidence_reduced", real=False, seeds=(0,), counts=(400, 4000), minutes=(60, 180),
