@@ -1,7 +1,7 @@
 """The ten configurations of the paper's Table 2, at full size, on a CPU: ``python benchmarks/table2.py``.
 
     python benchmarks/table2.py run [names=SU,Bunny] [threads=1] [seconds=900]
-    python benchmarks/table2.py report        table into docs/speed.md
+    python benchmarks/table2.py report        table and figure into docs/speed.md
 
 Each configuration runs in a fresh process, so that its peak memory is its own, and to the paper's number of iterations where they
 take less than ``seconds``; otherwise 12 iterations are measured, and the total is projected and marked so. Rows are stored as
@@ -20,7 +20,7 @@ import sys
 import time
 
 import torch
-from report import store, stored, table, write_section
+from report import ROOT, store, stored, table, write_section
 from timing import machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
 
@@ -83,7 +83,7 @@ def one(name: str, allowed_s: float) -> None:
 
 
 def report() -> None:
-    rows = []
+    rows, minutes = [], {}
     for workload in TABLE_2:
         twin = SAME.get(workload.name)
         r = stored("table2", workload.name) or (stored("table2", twin) if twin else None)
@@ -96,6 +96,7 @@ def report() -> None:
         wall = r["total_s"] if own else r["setup_s"] + workload.iterations * r["iteration_s"]
         setup, iteration = r.get("setup_cpu_s", r["setup_s"]), r.get("iteration_cpu_s", r["iteration_s"])
         core = setup + workload.iterations * iteration
+        minutes[workload.name] = (60 * workload.paper_hours, core / 60, wall / 60)
         how = "run to the end" if own and r["complete"] else f"projected from {r['measured_iterations']}"
         rows.append([
             workload.name, sizes, f"{setup:.0f} s", f"{iteration:.2f} s", str(workload.iterations),
@@ -105,7 +106,33 @@ def report() -> None:
         ])  # fmt: skip
     head = ["scene", "scan × bins → volume", "set-up", "iteration", "iterations", "total", "on the wall's clock", "iterations run",
             "paper, A100", "paper / total", "memory: estimated / measured", "rays that meet a surface"]  # fmt: skip
-    write_section("table2", table(head, rows))
+    figure = "![time of all iterations](images/table2.png)"
+    write_section("table2", table(head, rows) + ("\n\n" + figure if minutes else ""))
+    if minutes:
+        draw(minutes)
+
+
+def draw(minutes: dict[str, tuple[float, float, float]]) -> None:
+    """Bars of minutes by scene (paper; ours in the process's own time; ours on the wall's clock) into docs/images/table2.png."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    labels = ("paper, A100", "ours, one core's own time", "ours, on the wall's clock")
+    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for k, (label, colour) in enumerate(zip(labels, ("#888888", "#0072B2", "#56B4E9"), strict=True)):
+        places = [row + 0.27 * (k - 1) for row in range(len(minutes))]
+        axes.barh(places, [m[k] for m in minutes.values()], height=0.25, label=label, color=colour)
+    axes.set_yticks(range(len(minutes)), labels=list(minutes))
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="set-up and all iterations (min)")
+    axes.set_xticks([1, 3, 10, 30, 100, 300], labels=["1", "3", "10", "30", "100", "300"])
+    axes.tick_params(axis="x", which="minor", bottom=False)
+    axes.grid(axis="x", alpha=0.3)
+    figure.legend(loc="outside upper center", ncols=3, fontsize=8)
+    figure.savefig(ROOT / "docs" / "images" / "table2.png", dpi=110)
+    plt.close(figure)
 
 
 def main(arguments: list[str]) -> None:
