@@ -122,10 +122,10 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
-    new = [e(scan) for e in EFFECTS if e.name not in have]
     form = next((form_of(problem, projector, e) for e in fit.extension.effects if e.name == latest), None)
-    candidates = screen(problem, projector, new, folds)
-    rest = discrepancies(problem, projector, scan, [e for e in new if e.per_spot])
+    candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
+    asked = [c.effect for c in candidates if c.effect.per_spot and c.p_value < s.level and c.gain > s.least_gain]
+    rest = discrepancies(problem, projector, scan, asked)
     return Look(candidates, rest, projector.own, form if form is not None and form.wrong else None)
 
 

@@ -1,9 +1,9 @@
 """Flexible discrepancies: may say that something is wrong along an axis, never what (after Kennedy and O'Hagan, 2001).
 
 Each axis has its own columns: the expected counts within one band of the axis. Along wall and scan there is one more set for every
-effect with one random number a spot: that number, the same within a band. So an object that moves during the scan shows as a delay
-that is smooth along it, and not as jitter. All are tested like effects, projected off the base and all accepted effects, and
-cross-validated over random spots.
+effect with one random number a spot that the counts ask for: that number, the same within a band. So an object that moves during
+the scan shows as a delay that is smooth along it, and not as jitter. All are tested like effects, projected off the base and all
+accepted effects, and cross-validated over random spots.
 """
 
 from __future__ import annotations
