@@ -53,6 +53,7 @@ def test_what_no_effect_explains_is_called_unexplained():
     check(run_case(Spec("default", ("mains_ripple",), (2,), 1500, 15), QUICK, oracle=False))
 
 
+@pytest.mark.slow
 def test_a_gap_in_the_time_codes_is_not_called_a_ripple():
     """Five codes lose 90 %: a ripple with half a period there gains most by far, but its strength is not the same everywhere."""
     check(run_case(Spec("sphere_before_plate", ("missing_codes",), (3,), 500, 1), QUICK, oracle=False))
