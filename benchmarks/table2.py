@@ -114,13 +114,13 @@ def report() -> None:
 
 def draw(minutes: dict[str, tuple[float, float, float]]) -> None:
     """Bars of minutes by scene (paper; ours in the process's own time; ours on the wall's clock) into docs/images/table2.png."""
-    import matplotlib
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from nlos_lit.figures import save_figure
 
     labels = ("paper, A100", "ours, one core's own time", "ours, on the wall's clock")
-    figure, axes = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    figure = Figure(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
     for k, (label, colour) in enumerate(zip(labels, ("#888888", "#0072B2", "#56B4E9"), strict=True)):
         places = [row + 0.27 * (k - 1) for row in range(len(minutes))]
         axes.barh(places, [m[k] for m in minutes.values()], height=0.25, label=label, color=colour)
@@ -131,8 +131,7 @@ def draw(minutes: dict[str, tuple[float, float, float]]) -> None:
     axes.tick_params(axis="x", which="minor", bottom=False)
     axes.grid(axis="x", alpha=0.3)
     figure.legend(loc="outside upper center", ncols=3, fontsize=8)
-    figure.savefig(ROOT / "docs" / "images" / "table2.png", dpi=110)
-    plt.close(figure)
+    save_figure(figure, ROOT / "docs" / "images" / "table2.png")
 
 
 def main(arguments: list[str]) -> None:

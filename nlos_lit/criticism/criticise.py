@@ -123,10 +123,12 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
     form = next((form_of(problem, projector, e) for e in fit.extension.effects if e.name == latest), None)
+    if form is not None and form.wrong:  # the effect goes, and with it all that a screening beside it would say
+        return Look([], [], projector.own, form)
     candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
     asked = [c.effect for c in candidates if c.effect.per_spot and c.p_value < s.level and c.gain > s.least_gain]
     rest = discrepancies(problem, projector, scan, asked)
-    return Look(candidates, rest, projector.own, form if form is not None and form.wrong else None)
+    return Look(candidates, rest, projector.own)
 
 
 def turn(

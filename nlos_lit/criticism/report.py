@@ -87,8 +87,8 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         return "".join(image for name, image in images.items() if name.startswith(starts) and name not in set(extra))
 
     name = str(diagnosis.capture.get("name", "capture"))
-    several = missing(diagnosis) if len(missing(diagnosis)) > 1 else []
-    each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in several) + "</ol>" if several else ""
+    found = missing(diagnosis)
+    each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
     parts = [
         f'<header><p class="over">Diagnosis of {_text(name)}</p>'
         f'<h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis, listed=False))}</h1>{each}'

@@ -101,7 +101,8 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         controls = found.turns[0].controls or [found.base, refit_with(found.base, [], options.steps, 0)]
         before = best_likelihood(controls, split)
         gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
-        best = oracle_gain(truth, found, capture, options, before) if oracle and truth.names else best
+        if oracle and truth.names:
+            best = oracle_gain(truth, found, capture, options, before)
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,

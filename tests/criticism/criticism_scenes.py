@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture import Capture
+from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.sensitivity import Problem
 from nlos_lit.effects import EFFECTS, Effect, Extension, Scan
 from nlos_lit.parameters import BoundedParameter
@@ -18,6 +19,7 @@ from nlos_lit.surfel_fit import RefineSettings, SurfelFit
 from nlos_lit.surfels import Lateral, SurfelModel, spline_sensor
 
 BIN, T_START, GATE = 0.02, 0.62, (6, 64)
+BLOCK = np.repeat(np.arange(40), 3)  # wall blocks of 120 spots
 # PyTorch's own first use of forward mode.
 FORWARD_MODE = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 
@@ -134,3 +136,19 @@ def fit_of(model: SurfelModel, scene: Capture, extension: Extension | None = Non
     return SurfelFit(
         model, scene, None, counts, torch.from_numpy(rows), RefineSettings(), None, extension, generator, order
     )  # fmt: skip
+
+
+def candidate(
+    name: str, p_value: float = 1e-9, gain: float = 100.0, retained: float = 0.5, direction: Tensor | None = None
+) -> Candidate:
+    """What a screening might have found, on a capture of twelve spots."""
+    effect = effect_of(name, Scan.of(capture_of(scattered(12))))
+    size = sum(p.size for p in effect.amplitudes)
+    direction = torch.ones(4) / 2 if direction is None else direction
+    return Candidate(effect, 2 * gain, p_value, retained, gain, torch.zeros(size), torch.ones(size), {}, direction)
+
+
+def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:
+    """Log-likelihoods of 120 spots that are ``mean`` each on average, exactly, and scatter from block to block."""
+    values = np.repeat(np.random.default_rng(seed).standard_normal(40), 3)
+    return torch.from_numpy(mean + scatter * (values - values.mean()) / values.std())

@@ -4,58 +4,46 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, scattered, surfels
+from criticism_scenes import (
+    BLOCK,
+    FORWARD_MODE,
+    candidate,
+    capture_of,
+    drawn,
+    effect_of,
+    fit_of,
+    per_spot,
+    raster,
+    scattered,
+    surfels,
+)  # fmt: skip
 from scipy import stats
 from scipy.special import gammaln
 from torch import Tensor
 
-from nlos_lit.criticism import criticise as loop
-from nlos_lit.criticism import needless
 from nlos_lit.criticism.criticise import (
     CriticismSettings,
-    Findings,
-    Look,
     Trial,
-    Turn,
     best_of_each,
     choose,
-    criticise,
     group_of,
     needed,
     significant,
 )
-from nlos_lit.criticism.form import Form
 from nlos_lit.criticism.joint_step import null_of, set_step
-from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with, score
 from nlos_lit.criticism.screen import Candidate
-from nlos_lit.criticism.steps import Steps
 from nlos_lit.effects import Extension, Scan
 
 SCAN = Scan.of(capture_of(scattered(12)))
-BLOCK = np.repeat(np.arange(40), 3)
-
-
-def candidate(name: str, p_value: float = 1e-9, gain: float = 100.0, retained: float = 0.5, direction: Tensor | None = None):
-    effect = effect_of(name, SCAN)
-    size = sum(p.size for p in effect.amplitudes)
-    direction = torch.ones(4) / 2 if direction is None else direction
-    return Candidate(effect, 2 * gain, p_value, retained, gain, torch.zeros(size), torch.ones(size), {}, direction)
 
 
 def trial(name: str, likelihood: Tensor, gain: float, **options) -> Trial:
     return Trial(candidate(name, **options), None, Comparison(gain, 1.0, (gain - 2, gain + 2)), likelihood)
-
-
-def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:
-    """Log-likelihoods of 120 spots that are ``mean`` each on average, exactly, and scatter from block to block."""
-    values = np.repeat(np.random.default_rng(seed).standard_normal(40), 3)
-    return torch.from_numpy(mean + scatter * (values - values.mean()) / values.std())
 
 
 def test_comparison_by_hand():
@@ -196,107 +184,3 @@ def test_a_refit_begins_at_the_step_and_leaves_the_fit_alone():
     control = refit_with(fit, [], 15, seed=0)
     rows = np.arange(64)
     assert compare(log_likelihood(control, rows), log_likelihood(again, rows), rows).interval[0] > 0
-
-
-class FakeFit:
-    """Stands for a fit: its log-likelihood is a table's entry for its effects."""
-
-    def __init__(self, names: tuple[str, ...]) -> None:
-        self.extension = Extension([effect_of(n, SCAN) for n in names])
-
-    def copy(self, extension: Extension, seed: int) -> FakeFit:
-        return FakeFit(tuple(e.name for e in extension.effects))
-
-    def run(self, *_, **__) -> None:
-        pass
-
-    @property
-    def names(self) -> frozenset[str]:
-        return frozenset(e.name for e in self.extension.effects)
-
-
-SPLIT = SimpleNamespace(select=np.arange(120), fit=np.arange(300), block=BLOCK)
-
-
-def with_table(monkeypatch, table: dict[str, float]) -> None:
-    """``table``: what each effect is worth, nats a spot, with some scatter."""
-    monkeypatch.setattr(needless, "refit_with", lambda fit, *_: fit)
-
-    def likelihood(fit: FakeFit, spots: np.ndarray) -> Tensor:
-        return per_spot(0, 1) + sum(per_spot(table[n], 0.1) for n in sorted(fit.names))
-
-    monkeypatch.setattr(needless, "log_likelihood", likelihood)
-
-
-def test_needless_effects_are_dropped(monkeypatch):
-    with_table(monkeypatch, {"irf_tail": 2.0, "afterpulsing": 0.001, "pile_up": -0.5})
-    said = []
-    steps = Steps(lambda text, *_: said.append(text))
-    kept = drop_needless(FakeFit(("irf_tail", "afterpulsing", "pile_up")), SPLIT, 60, 0, steps)
-    assert kept.names == {"irf_tail"}
-    without = [text for text in said if "without" in text]
-    assert len(without) == 5  # three, then two; a single effect was compared with none when it was accepted
-
-
-def test_needed_effects_stay(monkeypatch):
-    with_table(monkeypatch, {"irf_tail": 2.0, "pile_up": 0.3})
-    fit = FakeFit(("irf_tail", "pile_up"))
-    assert drop_needless(fit, SPLIT, 60, 0, Steps()) is fit
-
-
-def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
-    """Each turn accepts the next effect: at most ``most``, then one last look; dropped ones no longer count as accepted."""
-    names = ["irf_tail", "pile_up", "vignetting", "gate_edges"]
-    rest = [SimpleNamespace(axis="time")]
-
-    def turn(fit, rebuild, split, scan, s, seed, steps, latest) -> Turn:
-        k = len(fit.extension.effects)
-        if k == len(accepting):
-            return Turn([], [], [], None, [])
-        accepted = Trial(candidate(accepting[k]), FakeFit(tuple(accepting[: k + 1])), Comparison(9, 1, (7, 11)), torch.zeros(120))
-        return Turn([], [], [accepted], accepted, [])
-
-    monkeypatch.setattr(loop, "turn", turn)
-    monkeypatch.setattr(loop, "look", lambda *_: Look([], rest, None))
-
-    def drop(fit: FakeFit, *_: object) -> FakeFit:
-        return FakeFit(tuple(n for n in accepting if n in fit.names and n != "pile_up"))
-
-    monkeypatch.setattr(loop, "drop_needless", drop)
-    accepting = names
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(most=3), 0)
-    assert [t.accepted and t.accepted.name for t in found.turns] == ["irf_tail", "pile_up", "vignetting", None]
-    assert [t.accepted.name for t in found.accepted] == ["irf_tail", "vignetting"]
-    assert found.left is rest
-    accepting = []
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(), 0)
-    assert isinstance(found, Findings)
-    assert found.accepted == []
-    assert len(found.turns) == 1
-
-
-def test_an_effect_of_the_wrong_form_is_taken_back(monkeypatch):
-    """The tail stays, the ripple after it goes, and what is left is what was left before the ripple."""
-    wrong = Form("tcspc_nonlinearity", 900.0, 1000.0, 1800.0, 0.0)
-    names = ["irf_tail", "tcspc_nonlinearity"]
-    asked = []
-
-    def turn(fit, rebuild, split, scan, s, seed, steps, latest) -> Turn:
-        asked.append(latest)
-        k = len(fit.extension.effects)
-        if k == 2:
-            return Turn([], ["after the ripple"], [], None, [], form=wrong)
-        accepted = Trial(candidate(names[k]), FakeFit(tuple(names[: k + 1])), Comparison(9, 1, (7, 11)), torch.zeros(120))
-        return Turn([], [f"with {k} effects"], [accepted], accepted, [])
-
-    monkeypatch.setattr(loop, "turn", turn)
-    monkeypatch.setattr(loop, "drop_needless", lambda fit, *_: fit)
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(), 0)
-    assert asked == ["", *names]
-    assert [t.accepted.name for t in found.accepted] == ["irf_tail"]
-    assert found.left == ["with 1 effects"]
-    assert found.wrong is wrong
-    # The last that may be accepted is looked at just so.
-    monkeypatch.setattr(loop, "look", lambda *_: Look([], ["after the ripple"], None, wrong))
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(most=2), 0)
-    assert ([t.accepted.name for t in found.accepted], found.left) == (["irf_tail"], ["with 1 effects"])
