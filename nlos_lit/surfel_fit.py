@@ -114,11 +114,12 @@ class SurfelFit:
 
     @torch.no_grad()
     def match_energy(self) -> None:
-        """Set the intensity so that rendered and measured light agree."""
-        sensor = self.model.laser_sensor
-        rendered = (self.model.expected(self.train[self.tested], self.extension) - sensor.background()).sum()
-        measured = (self.counts[self.tested] - sensor.background()).sum()
-        value = float(measured.clamp_min(0.01 * self.counts[self.tested].sum()) / rendered.clamp_min(1e-30))
+        """Set the intensity so that rendered light makes up for what the background does not count, through all effects."""
+        sensor, spots, counted = self.model.laser_sensor, self.train[self.tested], self.counts[self.tested].sum()
+        nothing = torch.zeros(len(spots), self.model.n_bins, device=spots.device)
+        dark = self.model.detect(nothing, spots, self.extension)[:, self.model.gate[0] :].sum()
+        light = self.model.light(spots, self.extension).sum()
+        value = float((counted - dark).clamp_min(0.01 * counted) / light.clamp_min(1e-30)) * sensor.intensity().item()
         sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
 
     def _batch(self) -> Tensor:

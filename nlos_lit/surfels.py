@@ -224,8 +224,17 @@ class SurfelModel(nn.Module):
     @torch.no_grad()
     def expected(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
         """:meth:`render` without gradients, in batches of about two million paths."""
-        size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
-        return torch.cat([self.render(part, hooks) for part in spots.split(size)])
+        return torch.cat([self.render(part, hooks) for part in self._batches(spots)])
+
+    @torch.no_grad()
+    def light(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+        """``[B, T_gate]`` counts of the light by itself, before background and counting effects."""
+        parts = self._batches(spots)
+        signals = [hooks.gain(self.signal(self.transients(self.paths(p), p, hooks), hooks), p) for p in parts]
+        return torch.cat(signals)[:, self.gate[0] :]
+
+    def _batches(self, spots: Tensor) -> tuple[Tensor, ...]:
+        return spots.split(max(1, (1 << 21) // max(1, len(self) * self.quadrature**2)))
 
     def points(self) -> Points:
         """Surfel centres with normals and albedo."""

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies, smooth
-from nlos_lit.criticism.form import Form, form_of
+from nlos_lit.criticism.form import Form, forms_of
 from nlos_lit.criticism.joint_step import copy_effects, null_of
 from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import compare, log_likelihood, refit_with, score
@@ -40,6 +40,7 @@ class CriticismSettings:
         spots: fitted spots that score tests look at at most (fewer where there are very many surfels).
         level: largest p-value, Holm-adjusted over all effects.
         least_gain: nats that the score test must predict …
+        least_shape: … for effects that neither move nor scale the light: of these the base's own errors feign fewer …
         least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
         rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds;
             the one that was screened best is always among them.
@@ -56,6 +57,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 1e-3
     least_gain: float = 25.0
+    least_shape: float = 15.0
     least_share: float = 0.02
     rivals: int = 5
     hopeless: float = 0.2
@@ -122,9 +124,9 @@ def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: i
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
-    form = next((form_of(problem, projector, e) for e in fit.extension.effects if e.name == latest), None)
-    if form is not None and form.wrong:  # the effect goes, and with it all that a screening beside it would say
-        return Look([], [], projector.own, form)
+    wrong = [form for e in fit.extension.effects if e.name == latest for form in forms_of(problem, projector, e) if form.wrong]
+    if wrong:  # the effect goes, and with it all that a screening beside it would say
+        return Look([], [], projector.own, wrong[0])
     candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
     asked = [c.effect for c in candidates if c.effect.per_spot and c.p_value < s.level and c.gain > s.least_gain]
     rest = discrepancies(problem, projector, scan, asked)
@@ -212,7 +214,8 @@ def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
     The less of an effect the base leaves over, the more easily the base's own approximations look like it: below ``WELL`` retained
     information it must gain more, by the root of what is missing.
     """
-    return max(s.least_gain * max(1.0, (WELL / max(candidate.retained, 1e-6)) ** 0.5), s.least_share * over)
+    least = s.least_gain if candidate.effect.moves_light else s.least_shape
+    return max(least * max(1.0, (WELL / max(candidate.retained, 1e-6)) ** 0.5), s.least_share * over)
 
 
 def misfit_and_noise(fit: SurfelFit, split: Split) -> tuple[float, float]:
@@ -236,11 +239,12 @@ def significant(candidates: list[Candidate], s: CriticismSettings, over: float) 
 
 @dataclass
 class Findings:
-    """What the loop leaves behind: the base, every turn, and the final extended fit."""
+    """What the loop leaves behind: the base, every turn, the final extended fit, and the same ``again`` from new seeds."""
 
     base: SurfelFit
     final: SurfelFit
     turns: list[Turn]
+    again: SurfelFit | None = None
 
     @property
     def accepted(self) -> list[Turn]:
@@ -284,4 +288,9 @@ def criticise(
     if turns[-1].form is not None:
         fit = before
     fit = drop_needless(fit, split, s.steps, seed, steps)
-    return Findings(base, fit, turns)
+    again = None
+    if len(fit.extension.effects):
+        steps.plan(fit=1)
+        once_more = partial(_rebuilt, rebuild, fit.extension, seed + 2)
+        again = steps("fit", "rebuilding the scene once more: do the parameters come back?", "again", once_more)
+    return Findings(base, fit, turns, again)

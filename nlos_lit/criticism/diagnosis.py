@@ -12,7 +12,8 @@ from nlos_lit.capture import Capture
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn, tested_rows, tested_spots
 from nlos_lit.criticism.discrepancy import Discrepancy
 from nlos_lit.criticism.estimate import Uncertainty
-from nlos_lit.criticism.refit import score
+from nlos_lit.criticism.form import Form
+from nlos_lit.criticism.refit import log_likelihood, score
 from nlos_lit.criticism.residuals import profiles
 from nlos_lit.criticism.result import Accepted, Diagnosis, Gain, Screened, Unexplained
 from nlos_lit.criticism.screen import Candidate
@@ -21,6 +22,7 @@ from nlos_lit.criticism.toys import Null
 from nlos_lit.criticism.witness import witness
 from nlos_lit.effects.base import Effect
 from nlos_lit.effects.scan import Scan
+from nlos_lit.surfel_fit import SurfelFit
 
 SEEN = 25.0  # statistic from which on an effect counts as detectable
 SPLIT_BY = {
@@ -70,10 +72,12 @@ def assemble(
     counts, block = final.counts[rows], torch.from_numpy(split.block[spots])
     uncertainty = Uncertainty(final, torch.from_numpy(spots), counts, block, len(rows) / len(split.fit))
     verdicts = judge(found, split, settings)
+    fresh = found.again.extension.effects if found.again is not None and sensible(found.again, base, split) else []
     effects, groups = [], []
     for turn in [] if verdicts.dominates else found.accepted:
         effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
-        effects.append(_accepted(turn, effect, uncertainty, split, null))
+        again = next((e for e in fresh if e.name == effect.name), None)
+        effects.append(_accepted(turn, effect, again, uncertainty, split, null))
         if turn.group:
             groups.append([turn.accepted.name, *turn.group])
     notes = []
@@ -82,11 +86,7 @@ def assemble(
         notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
         final = base
     if found.wrong is not None:
-        form = found.wrong
-        notes.append(
-            f"{form.name} improved the fit, but would need another strength in every stretch of the {form.axis} axis "
-            f"({form.gain:.0f} nats, of {form.own:.0f} that it changes itself), and is therefore not named"
-        )
+        notes.append(_of_another_form(found.wrong))
     fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
     return Diagnosis(
         effects=effects,
@@ -107,12 +107,23 @@ def assemble(
     )
 
 
+def _of_another_form(form: Form) -> str:
+    share = f"({form.gain:.0f} nats, of {form.own:.0f} that it changes itself)"
+    why = (
+        f"would need another strength in every stretch of the {form.axis} axis {share}"
+        if form.axis == "time"
+        else f"is a function of the scene's own count rate {share}, of which it should know nothing"
+    )
+    return f"{form.name} improved the fit, but {why}, and is therefore not named"
+
+
 def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
     """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain."""
     rest = [d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain]
     worst = max(rest, key=lambda d: d.gain, default=None)
-    if worst is None and found.wrong is not None:
-        return Verdicts(Unexplained(True, found.wrong.axis, found.wrong.statistic, found.wrong.p_value), False)
+    if found.wrong is not None:
+        dominates = worst is not None and _outweighs(worst, found, split, settings)
+        return Verdicts(Unexplained(True, found.wrong.axis, found.wrong.statistic, found.wrong.p_value), dominates)
     if worst is None:
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
@@ -136,14 +147,22 @@ def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: Criti
     return had - left.gain > 0.5 * predicted and left.gain > spared * had
 
 
-def _accepted(turn: Turn, effect: Effect, uncertainty: Uncertainty, split: Split, null: Null | None) -> Accepted:
+def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
+    """Whether a rebuild with the effects is likelier than the base without them: else it got stuck, and says nothing of them."""
+    with_, without = (float(log_likelihood(fit, split.select).sum()) for fit in (again, base))
+    return with_ > without
+
+
+def _accepted(
+    turn: Turn, effect: Effect, again: Effect | None, uncertainty: Uncertainty, split: Split, null: Null | None
+) -> Accepted:
     trial = turn.accepted
     statistic, p = trial.candidate.statistic, trial.candidate.p_value
     if null is not None:
         p = null.p_value(trial.candidate)
     return Accepted(
         name=effect.name,
-        parameters=uncertainty.parameters(effect),
+        parameters=uncertainty.parameters(effect, again),
         statistic=statistic,
         p_value=p,
         heldout_gain=_gain(trial, split),

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import math
+
 import torch
 from torch import Tensor
 
@@ -10,6 +13,8 @@ from nlos_lit.criticism.screen import Projector
 from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
 from nlos_lit.effects.base import Effect
 from nlos_lit.surfel_fit import SurfelFit
+
+REACH = 3.0  # standard errors over which quantities are displaced
 
 
 class Uncertainty:
@@ -40,20 +45,37 @@ class Uncertainty:
         grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
         self.covariance = share * inverse * grow[:, None] * grow[None, :]
 
-    def parameters(self, effect: Effect) -> dict[str, Estimate]:
-        """Reported quantities; errors by the delta method. The width of per-spot effects: from the number of spots."""
+    def parameters(self, effect: Effect, again: Effect | None = None) -> dict[str, Estimate]:
+        """Reported quantities and their errors. The width of per-spot effects: from the number of spots.
+
+        An error is a third of the change over three standard errors along each axis of the covariance, the larger of both ways, in
+        quadrature: the delta method where a quantity is linear, and more where it bends, as the length of a vector does whose
+        largest component is not settled. ``again``: the same effect in a fit from new seeds; the difference is an error, too.
+        """
         if effect.per_spot:
             return _spread(effect)
         offset = sum(e_size(e) for e in self.effects[: self.effects.index(effect)])
-        raws = [getattr(effect, f"raw_{p.name}") for p in [*effect.amplitudes, *effect.shapes]]
-        own = self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)]
+        variance, axes = torch.linalg.eigh(self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)])
+        steps = REACH * variance.clamp_min(0).sqrt() * axes
+        moved = [[_displaced(effect, sign * step) for sign in (1, -1)] for step in steps.T.float()]
         found = {}
         for name, quantity in effect.quantities().items():
-            grads = torch.autograd.grad(quantity.value, raws, allow_unused=True, retain_graph=True)
-            slope = torch.cat([torch.zeros_like(r) if g is None else g for g, r in zip(grads, raws, strict=True)]).double()
-            variance = float(slope @ own @ slope)
-            found[name] = Estimate(float(quantity.value.detach()), max(variance, 0.0) ** 0.5, quantity.unit)
+            value = float(quantity.value.detach())
+            errors = [max(abs(side[name] - value) for side in both) / REACH for both in moved]
+            if again is not None:
+                errors.append(abs(float(again.quantities()[name].value.detach()) - value))
+            found[name] = Estimate(value, math.hypot(*errors), quantity.unit)
         return found
+
+
+@torch.no_grad()
+def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
+    """Quantities with all stored values moved by ``step``, without regard to bounds."""
+    moved = copy.deepcopy(effect)
+    for p in [*moved.amplitudes, *moved.shapes]:
+        getattr(moved, f"raw_{p.name}").add_(step[: p.size])
+        step = step[p.size :]
+    return {name: float(quantity.value) for name, quantity in moved.quantities().items()}
 
 
 def e_size(effect: Effect) -> int:

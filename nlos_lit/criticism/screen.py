@@ -62,6 +62,8 @@ class Projector:
     def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
         x = problem.nuisance
         gram = half_products(x).double()
+        if not bool(torch.isfinite(gram).all()):
+            raise ValueError("the model's sensitivities are not finite: this fit cannot be criticised")
         diagonal = gram.diagonal().clone().clamp_min(float(gram.diagonal().mean()) * 1e-6)
         failed = 1
         while failed:  # single-precision products of nearly dependent columns may need more

@@ -129,6 +129,11 @@ class Effect(nn.Module, Hooks):
         return (torch.tensor(p.prior) * (self.prior_scale / p.scale)).square().reciprocal()
 
     @property
+    def moves_light(self) -> bool:
+        """It moves light in time or scales it, path by path or spot by spot, as errors of places, normals and albedos do."""
+        return any(getattr(type(self), hook) is not getattr(Hooks, hook) for hook in ("path", "time", "gain"))
+
+    @property
     def amplitudes(self) -> list[Parameter]:
         """Parameters with a null value."""
         return [p for p in self.declared.values() if p.null is not None]

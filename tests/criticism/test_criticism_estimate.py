@@ -31,20 +31,47 @@ def known(effects: list[Effect], covariance: Tensor) -> Uncertainty:
 
 
 def test_delta_method_by_hand():
-    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01 raw}: slope 0.01 P."""
+    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01 raw}: slope 0.01 P.
+
+    Small errors, so that nothing bends.
+    """
     ripple = effect_of("tcspc_nonlinearity", SCAN, sine=0.06, cosine=0.08, period=10.0)
     slope = effect_of("background_slope", SCAN, slope=0.2)
     covariance = torch.diag(torch.tensor([9.0, 1.0, 4.0, 0.25]))
     covariance[1, 2] = covariance[2, 1] = -1.0
+    covariance *= 1e-5
     found = known([slope, ripple], covariance).parameters(ripple)
-    variance = 0.02**2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
+    variance = 1e-5 * 0.02**2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
     assert found["amplitude"].value == pytest.approx(0.1, rel=1e-3)
-    assert found["amplitude"].stderr == pytest.approx(variance**0.5, rel=1e-3)
-    assert found["period"].stderr == pytest.approx(0.01 * 10 * 0.5, rel=1e-4)
+    assert found["amplitude"].stderr == pytest.approx(variance**0.5, rel=3e-3)
+    assert found["period"].stderr == pytest.approx(1e-5**0.5 * 0.01 * 10 * 0.5, rel=3e-3)
     assert (found["amplitude"].unit, found["period"].unit) == ("1", "bins")
     own = known([slope, ripple], covariance).parameters(slope)
     assert own["slope"].value == pytest.approx(0.2)
-    assert own["slope"].stderr == pytest.approx(0.05 * 3)
+    assert own["slope"].stderr == pytest.approx(1e-5**0.5 * 0.05 * 3, rel=1e-3)
+
+
+def test_the_length_of_a_vector_is_unsure_where_its_largest_component_is():
+    """Coefficients (0, 3) steps with errors 2 and 0.1 steps: over three errors the length goes from 3 to √(9 + 36)."""
+    drift = effect_of("power_drift", SCAN)
+    scale = drift.declared["drift"].scale
+    values = torch.zeros(drift.declared["drift"].size)
+    values[1] = 3 * scale
+    drift.set("drift", values)
+    covariance = torch.zeros(len(values), len(values))
+    covariance[0, 0], covariance[1, 1] = 4.0, 0.01
+    found = known([drift], covariance).parameters(drift)["rms"]
+    assert found.value == pytest.approx(3 * scale, rel=1e-3)
+    assert found.stderr == pytest.approx(scale * ((45**0.5 - 3) ** 2 / 9 + 0.01) ** 0.5, rel=1e-3)
+
+
+def test_a_parameter_that_comes_back_elsewhere_is_unsure():
+    """Errors of 0.3 from the counts, and of 0.4 from a fit from new seeds."""
+    slope, again = (effect_of("background_slope", SCAN, slope=value) for value in (0.2, -0.2))
+    scale = slope.declared["slope"].scale
+    known_slope = known([slope], torch.tensor([[(0.3 / scale) ** 2]]))
+    assert known_slope.parameters(slope)["slope"].stderr == pytest.approx(0.3, rel=1e-4)
+    assert known_slope.parameters(slope, again)["slope"].stderr == pytest.approx(0.5, rel=1e-4)
 
 
 def test_a_width_is_as_certain_as_its_spots_are_many():

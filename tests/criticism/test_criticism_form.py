@@ -8,7 +8,7 @@ from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 
 from nlos_lit.criticism.criticise import CriticismSettings, look
 from nlos_lit.criticism.discrepancy import discrepancies, smooth
-from nlos_lit.criticism.form import Form, form_of
+from nlos_lit.criticism.form import Form, forms_of
 from nlos_lit.criticism.screen import Projector, screen
 from nlos_lit.criticism.sensitivity import build_problem
 from nlos_lit.criticism.split import split_spots
@@ -30,9 +30,13 @@ def problem_with(scene, inside: list[Effect], measured: list[Effect], factor: to
     return problem, Projector(problem)
 
 
-def form(scene, effect: Effect, measured: list[Effect], factor: torch.Tensor | float = 1.0) -> Form | None:
+def forms(scene, effect: Effect, measured: list[Effect], factor: torch.Tensor | float = 1.0) -> dict[str, Form]:
     problem, projector = problem_with(scene, [effect], measured, factor)
-    return form_of(problem, projector, effect)
+    return {found.axis: found for found in forms_of(problem, projector, effect)}
+
+
+def form(scene, effect: Effect, measured: list[Effect], factor: torch.Tensor | float = 1.0) -> Form:
+    return forms(scene, effect, measured, factor)["time"]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +82,24 @@ def test_a_ripple_that_stands_for_a_gap_has_not(scene):
 
 
 def test_a_number_for_every_spot_has_no_common_strength(scene):
-    assert form(scene, effect_of("timing_jitter", Scan.of(scene)), []) is None
+    assert forms(scene, effect_of("timing_jitter", Scan.of(scene)), []) == {}
+
+
+def test_a_wall_that_is_dark_where_the_scene_is_bright_belongs_to_the_counting(scene):
+    """A map with minus half the logarithm of the scene's own totals, smooth, and one that knows nothing of the scene."""
+    scan, model = Scan.of(scene), surfels(scene)
+    wall = effect_of("wall_reflectance", scan)
+    rate = model.expected(torch.arange(scene.n_spots)).sum(1).log()
+    saturated = torch.linalg.lstsq(wall.functions, -0.5 * (rate - rate.mean())[:, None]).solution[:, 0]
+    own = torch.zeros(len(saturated))
+    own[:4] = torch.tensor([0.1, -0.2, 0.3, 0.1])
+    for values, wrong in ((saturated, True), (own, False)):
+        found = forms(scene, effect_of("wall_reflectance", scan, gain_map=values), [])
+        assert found["rate"].wrong is wrong
+        assert not found["time"].wrong
+        assert (found["rate"].gain > 0.9 * found["rate"].own) is wrong
+    assert found["rate"].own == pytest.approx(found["time"].own, rel=1e-5)
+    assert "rate" not in forms(scene, effect_of("vignetting", scan, strength=0.3), []), "one number is no map"
 
 
 def test_a_delay_that_neighbours_share_is_no_jitter(scene):

@@ -28,7 +28,7 @@ class FakeFit:
         self.extension = Extension([effect_of(n, SCAN) for n in names])
 
     def copy(self, extension: Extension, seed: int) -> FakeFit:
-        return FakeFit(tuple(e.name for e in extension.effects))
+        return rebuilt(extension, seed)
 
     def run(self, *_, **__) -> None:
         pass
@@ -36,6 +36,10 @@ class FakeFit:
     @property
     def names(self) -> frozenset[str]:
         return frozenset(e.name for e in self.extension.effects)
+
+
+def rebuilt(extension: Extension, seed: int) -> FakeFit:
+    return FakeFit(tuple(e.name for e in extension.effects))
 
 
 SPLIT = SimpleNamespace(select=np.arange(120), fit=np.arange(300), block=BLOCK)
@@ -89,14 +93,16 @@ def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
 
     monkeypatch.setattr(loop, "drop_needless", drop)
     offered = ["irf_tail", "pile_up", "vignetting", "gate_edges"]
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(most=3), 0)
+    found = criticise(FakeFit(()), rebuilt, SPLIT, SCAN, CriticismSettings(most=3), 0)
     assert [t.accepted and t.accepted.name for t in found.turns] == ["irf_tail", "pile_up", "vignetting", None]
     assert [t.accepted.name for t in found.accepted] == ["irf_tail", "vignetting"]
     assert found.left is rest
+    assert found.again.names == {"irf_tail", "vignetting"}, "rebuilt once more, to see whether the parameters come back"
     offered = []
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(), 0)
+    found = criticise(FakeFit(()), rebuilt, SPLIT, SCAN, CriticismSettings(), 0)
     assert isinstance(found, Findings)
     assert found.accepted == []
+    assert found.again is None
     assert len(found.turns) == 1
 
 
@@ -115,12 +121,12 @@ def test_an_effect_of_the_wrong_form_is_taken_back(monkeypatch):
 
     monkeypatch.setattr(loop, "turn", turn)
     monkeypatch.setattr(loop, "drop_needless", lambda fit, *_: fit)
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(), 0)
+    found = criticise(FakeFit(()), rebuilt, SPLIT, SCAN, CriticismSettings(), 0)
     assert asked == ["", *names]
     assert [t.accepted.name for t in found.accepted] == ["irf_tail"]
     assert found.left == ["with 1 effects"]
     assert found.wrong is wrong
     # The last that may be accepted is looked at just so.
     monkeypatch.setattr(loop, "look", lambda *_: Look([], [], None, wrong))
-    found = criticise(FakeFit(()), None, SPLIT, SCAN, CriticismSettings(most=2), 0)
+    found = criticise(FakeFit(()), rebuilt, SPLIT, SCAN, CriticismSettings(most=2), 0)
     assert ([t.accepted.name for t in found.accepted], found.left) == (["irf_tail"], ["with 1 effects"])
