@@ -112,7 +112,7 @@ def _of_another_form(form: Form) -> str:
     why = (
         f"would need another strength in every stretch of the {form.axis} axis {share}"
         if form.axis == "time"
-        else f"is a function of the scene's own count rate {share}, of which it should know nothing"
+        else f"is a falling function of the scene's own count rate {share}, of which it should know nothing"
     )
     return f"{form.name} improved the fit, but {why}, and is therefore not named"
 

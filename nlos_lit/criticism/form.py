@@ -4,8 +4,8 @@ An effect's equation says that one strength holds everywhere. Once it is in the 
 into bands of the time axis that weigh the same, and each may ask for a strength of its own. A ripple that was accepted for a gap in
 the time codes wants four times the strength at the gap, and none elsewhere.
 
-A smooth map over wall or scan knows nothing of the hidden scene. One that is, over the scan, a function of the scene's own light at
-each spot belongs to the counting: a detector that saturates looks like a wall that is dark wherever the scene is bright.
+A smooth map over wall or scan knows nothing of the hidden scene. One that falls with the scene's own light at each spot belongs to
+the counting: a detector that saturates looks like a wall that is dark wherever the scene is bright.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Form:
 
     ``own``: nats that the effect's own change is worth, ½‖Δμ/√μ‖². ``gain``: along time, nats that strengths of its own in every
     band bring beyond the common one, cross-validated over random spots; where the base leaves Δμ alone, gain/own is the relative
-    mean square by which the strength varies. Along rate, nats of ``own`` that a function of the count rate alone makes.
+    mean square by which the strength varies. Along rate, nats of ``own`` that a falling function of the count rate makes.
     """
 
     name: str
@@ -74,8 +74,12 @@ def _over_time(problem: Problem, projector: Projector, effect: Effect, change: T
 
 @torch.no_grad()
 def _over_rate(problem: Problem, effect: SmoothEffect, change: Tensor, rate: Tensor) -> Form:
-    """``change`` ``[S, T]`` Δμ/√μ, ``rate`` ``[S]`` counts without the effect. p: share of maps drawn from the prior that follow
-    the rate as well.
+    """Only maps that fall as the rate grows count: no detector sees better for more light, but a wall is lit most where a scene is.
+
+    Args:
+        change: ``[S, T]`` Δμ/√μ. rate: ``[S]`` counts without the effect.
+
+    p: share of maps drawn from the prior that follow the rate as well.
     """
     field = effect.field(problem.spots).double()
     worth = change.double().square().sum(1)
@@ -83,13 +87,14 @@ def _over_rate(problem: Problem, effect: SmoothEffect, change: Tensor, rate: Ten
     place = rate.double().log()
     place = (place - place.mean()) / place.std().clamp_min(1e-12)
     powers = torch.stack([place**k for k in range(POWERS + 1)], 1) * weight[:, None]
-    flat, rates = (torch.linalg.qr(powers[:, :k])[0] for k in (1, POWERS + 1))
+    basis, triangle = torch.linalg.qr(powers)
     (coefficients,) = effect.amplitudes
     random = torch.randn(DRAWS, coefficients.size, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     maps = effect.functions[problem.spots].double() @ (random * torch.tensor(coefficients.prior, dtype=torch.float64)).T
     values = torch.cat([field[:, None], maps], 1) * weight[:, None]
-    common = (flat.T @ values).square().sum(0)
-    share = ((rates.T @ values).square().sum(0) - common) / (values.square().sum(0) - common).clamp_min(1e-30)
+    common, slope, *bend = basis.T @ values
+    share = sum(part.square() for part in (slope, *bend)) / (values.square().sum(0) - common.square()).clamp_min(1e-30)
+    share = share * (slope * triangle[1, 1] < 0)
     p = float((1 + (share[1:] >= share[0]).sum()) / (1 + DRAWS))
     own = float(worth.sum()) / 2
     gain = float(share[0]) * own

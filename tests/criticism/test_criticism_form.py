@@ -86,14 +86,14 @@ def test_a_number_for_every_spot_has_no_common_strength(scene):
 
 
 def test_a_wall_that_is_dark_where_the_scene_is_bright_belongs_to_the_counting(scene):
-    """A map with minus half the logarithm of the scene's own totals, smooth, and one that knows nothing of the scene."""
+    """A map with minus half the logarithm of the scene's own totals, smooth; its mirror image, which no detector makes; its own."""
     scan, model = Scan.of(scene), surfels(scene)
     wall = effect_of("wall_reflectance", scan)
     rate = model.expected(torch.arange(scene.n_spots)).sum(1).log()
     saturated = torch.linalg.lstsq(wall.functions, -0.5 * (rate - rate.mean())[:, None]).solution[:, 0]
     own = torch.zeros(len(saturated))
     own[:4] = torch.tensor([0.1, -0.2, 0.3, 0.1])
-    for values, wrong in ((saturated, True), (own, False)):
+    for values, wrong in ((saturated, True), (-saturated, False), (own, False)):
         found = forms(scene, effect_of("wall_reflectance", scan, gain_map=values), [])
         assert found["rate"].wrong is wrong
         assert not found["time"].wrong
