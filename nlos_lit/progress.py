@@ -14,7 +14,7 @@ log = logging.getLogger(__name__)
 
 
 class Ticker:
-    """One task's progress; ``update(done, note)`` may be called as often as one likes."""
+    """One task's progress; ``update`` may be called as often as one likes, with another total where more is to be done."""
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.start = what, total, done
@@ -27,9 +27,10 @@ class Ticker:
             self.task = self.bar.add_task(what, total=total, completed=done, note="")
         self.began = self.spoke = time.monotonic()
 
-    def update(self, done: int, note: str = "") -> None:
+    def update(self, done: int, note: str = "", total: int | None = None) -> None:
+        self.total = total or self.total
         if self.bar is not None:
-            self.bar.update(self.task, completed=done, note=note)
+            self.bar.update(self.task, completed=done, total=self.total, note=note)
             return
         now = time.monotonic()
         if (now - self.spoke > 10 or done == self.total) and done > self.start:
@@ -80,7 +81,7 @@ def planes_progress(what: str) -> Iterator[Callable[[int, int], None]]:
         nonlocal ticker
         if ticker is None:
             ticker = Ticker(what, total)
-        ticker.update(done)
+        ticker.update(done, total=total)
 
     try:
         yield progress
