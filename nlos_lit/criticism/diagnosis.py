@@ -73,14 +73,17 @@ def assemble(
     uncertainty = Uncertainty(final, torch.from_numpy(spots), counts, block, len(rows) / len(split.fit))
     verdicts = judge(found, split, settings)
     fresh = found.again.extension.effects if found.again is not None and sensible(found.again, base, split) else []
-    effects, groups = [], []
+    effects, groups, notes = [], [], []
     for turn in [] if verdicts.dominates else found.accepted:
+        p = turn.accepted.candidate.p_value if null is None else null.p_value(turn.accepted.candidate)
+        if p > settings.level:
+            notes.append(f"{turn.accepted.name} improved the fit, but captures simulated without it score as much (p = {p:.2g})")
+            continue
         effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
         again = next((e for e in fresh if e.name == effect.name), None)
-        effects.append(_accepted(turn, effect, again, uncertainty, split, null))
+        effects.append(_accepted(turn, effect, again, uncertainty, split, p))
         if turn.group:
             groups.append([turn.accepted.name, *turn.group])
-    notes = []
     if verdicts.dominates:
         names = ", ".join(t.accepted.name for t in found.accepted)
         notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
@@ -153,17 +156,12 @@ def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
     return with_ > without
 
 
-def _accepted(
-    turn: Turn, effect: Effect, again: Effect | None, uncertainty: Uncertainty, split: Split, null: Null | None
-) -> Accepted:
+def _accepted(turn: Turn, effect: Effect, again: Effect | None, uncertainty: Uncertainty, split: Split, p: float) -> Accepted:
     trial = turn.accepted
-    statistic, p = trial.candidate.statistic, trial.candidate.p_value
-    if null is not None:
-        p = null.p_value(trial.candidate)
     return Accepted(
         name=effect.name,
         parameters=uncertainty.parameters(effect, again),
-        statistic=statistic,
+        statistic=trial.candidate.statistic,
         p_value=p,
         heldout_gain=_gain(trial, split),
         confusable_with=turn.group,

@@ -223,7 +223,7 @@ def test_screened_in_units_of_the_parameters():
     scale = {p.name: p.scale for p in retro.amplitudes}
     assert found.one_step == pytest.approx({"falloff": 4 - scale["falloff"], "cosine": 1 + 0.5 * scale["cosine"]})
     drift = effect_of("power_drift", SCAN)
-    null = Null(4, {"power_drift": 2.0}, [])
+    null = Null(40, {"power_drift": (10.0, 20.0)}, [])
     candidate = Candidate(drift, 30.0, 1e-6, 0.4, 12.0, torch.tensor([1.0, 2, 0, 2, 0]), torch.full((5,), 0.2), {}, None)
     found = _screened(candidate, null)
     assert found.one_step["drift"] == pytest.approx(0.05 * (9 / 5) ** 0.5)

@@ -38,21 +38,21 @@ def candidate(name: str, statistic: float, size: int = 1) -> Candidate:
 
 
 def test_toys_by_hand(tmp_path):
-    """Statistics over degrees of freedom: 3 and 5 for the tail (mean 4), 0.4 and 0.8 for the drift (never shrunk)."""
-    for k, (tail, drift) in enumerate([(3.0, 2.0), (5.0, 4.0)]):
-        text = {
-            "statistic": {"irf_tail": tail, "power_drift": drift},
-            "degrees": {"irf_tail": 1, "power_drift": 5},
-            "largest": 2.5 - k,
-        }
+    """Ten toys of 3 and 5 in turn: mean 4, variance 10/9; a gamma distribution of shape 14.4 and scale 0.278."""
+    for k in range(10):
+        text = {"statistic": {"irf_tail": 3.0 + 2 * (k % 2), "power_drift": 0.0}, "largest": 2.5 - k}
         (tmp_path / f"toy_{k}.json").write_text(json.dumps(text))
-    null = read_toys([tmp_path / "toy_0.json", tmp_path / "toy_1.json"])
-    assert null == Null(2, {"irf_tail": 4.0, "power_drift": 1.0}, [2.5, 1.5])
-    shapes = len(effect_of("irf_tail", SCAN).shape_grid())
-    assert null.p_value(candidate("irf_tail", 40.0)) == pytest.approx(shapes * stats.chi2.sf(10, 1))
-    assert null.p_value(candidate("power_drift", 20.0, 5)) == pytest.approx(stats.chi2.sf(20, 5))
-    assert null.p_value(candidate("timing_jitter", 12.0, 12)) == pytest.approx(stats.chi2.sf(12, 2))
-    assert null.p_value(candidate("irf_tail", 0.1)) == 1
+    null = read_toys([tmp_path / f"toy_{k}.json" for k in range(10)])
+    assert null.moments == {"irf_tail": (4.0, pytest.approx(10 / 9)), "power_drift": (0.0, 0.0)}
+    assert (null.toys, null.largest[:2]) == (10, [2.5, 1.5])
+    seen = dataclasses.replace(candidate("irf_tail", 9.0), p_value=1e-5)
+    assert null.p_value(seen) == pytest.approx(stats.gamma.sf(9, 14.4, scale=10 / 36))
+    assert null.p_value(dataclasses.replace(seen, statistic=40.0)) == 1e-5, "never less than theory's"
+    assert null.p_value(dataclasses.replace(seen, statistic=0.1)) == pytest.approx(1)
+    assert null.p_value(dataclasses.replace(candidate("power_drift", 20.0), p_value=0.02)) == 0.02, "no toy showed any"
+    assert null.p_value(dataclasses.replace(candidate("timing_jitter", 20.0), p_value=0.02)) == 0.02, "not among the toys"
+    few = dataclasses.replace(null, toys=9)  # variance at least that of chi squared times 4: 32
+    assert few.p_value(seen) == pytest.approx(stats.chi2.sf(9 / 4, 1))
 
 
 def test_a_toy_is_drawn_from_the_fit():
@@ -72,7 +72,7 @@ def test_a_toy_is_drawn_from_the_fit():
 
 def test_interrupted_toys_go_on(tmp_path, monkeypatch):
     """Toy 1 is there already: it is read as it is, and only 0 and 2 are run, with their own seeds."""
-    (tmp_path / "toy_1.json").write_text(json.dumps({"statistic": {"irf_tail": 9.0}, "degrees": {"irf_tail": 1}, "largest": 7.0}))
+    (tmp_path / "toy_1.json").write_text(json.dumps({"statistic": {"irf_tail": 9.0}, "largest": 7.0}))
     monkeypatch.setattr(toys, "ProcessPoolExecutor", lambda processes, mp_context: ThreadPoolExecutor(processes))
     monkeypatch.setattr(toys, "look", lambda fit, split, scan, settings, seed: Look([candidate("irf_tail", 3.0 + seed)], [], None))
     scene = capture_of(raster(8))
@@ -89,7 +89,7 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
     assert seeds == [(k, int(toy_capture(scene, fit, k).counts.sum())) for k in (0, 2)]
     assert [text for text, *_ in said] == ["toy 2 of 3", "toy 3 of 3"]
     assert said[0][2] > said[1][2] == 0  # one to go, then none
-    assert null == Null(3, {"irf_tail": pytest.approx((3 + 9 + 5) / 3)}, [1.5, 7.0, 2.5])
+    assert null == Null(3, {"irf_tail": pytest.approx((17 / 3, 28 / 3))}, [1.5, 7.0, 2.5])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["toy_0.json", "toy_1.json", "toy_2.json"]
     again = run_toys(scene, fit, None, None, settings, tmp_path, None)
     assert again == null
