@@ -2,7 +2,8 @@
 
 What the pipeline itself does to a capture without effects (seeds, surfels that stay or die, an optimiser that stops) then counts as
 noise. A statistic is judged against a gamma distribution with the mean and variance of its toys, and against χ²: the larger p
-counts. On a bright capture a base leaves something like a slow tail every time, 190 ± 65 where χ² expects 1: no stretched χ² is so narrow.
+counts. On a bright capture a base leaves something like a slow tail every time, 190 ± 65 where χ² expects 1: no stretched χ² is
+so narrow.
 """
 
 from __future__ import annotations
