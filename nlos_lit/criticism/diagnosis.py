@@ -75,15 +75,16 @@ def assemble(
     fresh = found.again.extension.effects if found.again is not None and sensible(found.again, base, split) else []
     effects, groups, notes = [], [], []
     for turn in [] if verdicts.dominates else found.accepted:
-        p = turn.accepted.candidate.p_value if null is None else null.p_value(turn.accepted.candidate)
-        if p > settings.level:
+        p, feigned = weighed(turn.accepted.candidate, null, settings.level)
+        if feigned:
             notes.append(f"{turn.accepted.name} improved the fit, but captures simulated without it score as much (p = {p:.2g})")
             continue
         effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
         again = next((e for e in fresh if e.name == effect.name), None)
-        effects.append(_accepted(turn, effect, again, uncertainty, split, p))
-        if turn.group:
-            groups.append([turn.accepted.name, *turn.group])
+        group = alternatives(turn, found.accepted)
+        effects.append(_accepted(turn, effect, again, group, uncertainty, split, p))
+        if group:
+            groups.append([turn.accepted.name, *group])
     if verdicts.dominates:
         names = ", ".join(t.accepted.name for t in found.accepted)
         notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
@@ -108,6 +109,17 @@ def assemble(
         seconds=seconds,
         seed=seed,
     )
+
+
+def weighed(candidate: Candidate, null: Null | None, level: float) -> tuple[float, bool]:
+    """p-value, by toys where there are any, and whether it was only they who spoke against the effect."""
+    p = candidate.p_value if null is None else null.p_value(candidate)
+    return p, candidate.p_value <= level < p
+
+
+def alternatives(turn: Turn, accepted: list[Turn]) -> list[str]:
+    """A turn's group without what is needed beside its effect: that is no other name for it."""
+    return [name for name in turn.group if name not in {t.accepted.name for t in accepted}]
 
 
 def _of_another_form(form: Form) -> str:
@@ -156,7 +168,9 @@ def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
     return with_ > without
 
 
-def _accepted(turn: Turn, effect: Effect, again: Effect | None, uncertainty: Uncertainty, split: Split, p: float) -> Accepted:
+def _accepted(
+    turn: Turn, effect: Effect, again: Effect | None, group: list[str], uncertainty: Uncertainty, split: Split, p: float
+) -> Accepted:
     trial = turn.accepted
     return Accepted(
         name=effect.name,
@@ -164,8 +178,8 @@ def _accepted(turn: Turn, effect: Effect, again: Effect | None, uncertainty: Unc
         statistic=trial.candidate.statistic,
         p_value=p,
         heldout_gain=_gain(trial, split),
-        confusable_with=turn.group,
-        split_by="; ".join(sorted({SPLIT_BY.get(frozenset({effect.name, other}), "") for other in turn.group} - {""})),
+        confusable_with=group,
+        split_by="; ".join(sorted({SPLIT_BY.get(frozenset({effect.name, other}), "") for other in group} - {""})),
     )
 
 

@@ -11,7 +11,7 @@ from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 from torch import Tensor
 
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Turn
-from nlos_lit.criticism.diagnosis import _screened, judge
+from nlos_lit.criticism.diagnosis import _screened, alternatives, judge, weighed
 from nlos_lit.criticism.discrepancy import Discrepancy
 from nlos_lit.criticism.estimate import Uncertainty
 from nlos_lit.criticism.refit import Comparison
@@ -210,6 +210,27 @@ def test_names_fall_where_they_leave_much_of_their_own_kind():
     # Delays that neighbours share are another kind than gains, on the same axis.
     had = [Discrepancy("scan", 270, 540, 64, 0.0, "timing_jitter"), discrepancy("scan", 90)]
     assert not judge(findings([320.0, 320.0], left, had, 100.0), SPLIT, CriticismSettings()).dominates
+
+
+def test_toys_speak_against_what_theory_lets_pass():
+    """A tail of statistic 30: theory says 1e-6, toys of 25 ± 5 say 0.16. What theory had not asked for they cannot take back."""
+    found = Candidate(effect_of("irf_tail", SCAN), 30.0, 1e-6, 0.4, 12.0, None, None, {}, None)
+    assert weighed(found, None, 1e-3) == (1e-6, False)
+    p, feigned = weighed(found, Null(40, {"irf_tail": (25.0, 25.0)}, []), 1e-3)
+    assert p == pytest.approx(0.159, abs=0.01)
+    assert feigned
+    assert weighed(found, Null(40, {"irf_tail": (2.0, 4.0)}, []), 1e-3) == (1e-6, False)
+    rebuilt = Candidate(effect_of("specular_lobe", SCAN), 3.0, 0.4, 0.4, 12.0, None, None, {}, None)
+    assert weighed(rebuilt, Null(40, {"specular_lobe": (3.0, 4.0)}, []), 1e-3)[1] is False
+
+
+def test_what_is_needed_beside_an_effect_is_no_other_name_for_it():
+    def turn(name: str, group: list[str]) -> Turn:
+        accepted = Trial(Candidate(effect_of(name, SCAN), 0, 0, 0, 0, None, None, {}, None), None, Comparison(1, 1, (0, 0)), None)
+        return Turn([], [], [], accepted, group)
+
+    both = [turn("afterpulsing", ["ambient_map", "irf_tail"]), turn("ambient_map", ["afterpulsing"])]
+    assert [alternatives(t, both) for t in both] == [["irf_tail"], []]
 
 
 def test_screened_in_units_of_the_parameters():
