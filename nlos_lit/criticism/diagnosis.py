@@ -217,6 +217,7 @@ def _screened(candidate: Candidate, null: Null | None) -> Screened:
         one_step=step,
         shape=candidate.shape,
         detectable=detectable,
+        expected=float(candidate.degrees) if null is None else null.expected(candidate),
     )
 
 

@@ -106,9 +106,9 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
         hard, length = barely(one), one.statistic if one.statistic > 1 else 1.0  # NaN: no bar
         colour = NOTHING if hard else BLUE if one.name in accepted else SKY
         axes.barh(row, length - 1, left=1, height=0.72, color=colour, hatch="////" if hard else None, edgecolor=GREY, linewidth=0.6)
-        axes.plot([max(one.degrees, 1)] * 2, (row - 0.36, row + 0.36), color=BLACK, linewidth=1.6)
+        axes.plot([max(one.expected, 1)] * 2, (row - 0.36, row + 0.36), color=BLACK, linewidth=1.6)
         text = f"{number(one.statistic)}   keeps {percent(one.retained_information)}, gain {number(one.predicted_gain)} nats"
-        place = max(length, one.degrees) * largest**0.015
+        place = max(length, one.expected) * largest**0.015
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
         axes.text(place, row, text, va="center", fontsize="small", color=GREY if hard else BLACK, bbox=box)
     axes.axvline(SEEN, color=ORANGE, linestyle="--", linewidth=1)
@@ -118,7 +118,7 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
     axes.set_xticks([10.0**k for k in range(int(np.log10(largest)) + 1)])
     axes.minorticks_off()
     axes.set_title(
-        "black tick: expected from noise alone; dashed: counts as visible;\nhatched: barely identifiable here", loc="left"
+        "black tick: expected without the effect; dashed: counts as visible;\nhatched: barely identifiable here", loc="left"
     )
     return figure
 

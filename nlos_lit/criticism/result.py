@@ -47,6 +47,7 @@ class Screened:
 
     ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters, ``shape`` the
     scanned ones; ``detectable`` is the smallest amplitude of each parameter that this capture would reveal (statistic 25).
+    ``expected``: statistic without the effect, on average: degrees of freedom, or what toys show where that is more.
     """
 
     name: str
@@ -58,6 +59,7 @@ class Screened:
     one_step: dict[str, float]
     shape: dict[str, float]
     detectable: dict[str, float]
+    expected: float
 
 
 @dataclass(frozen=True)

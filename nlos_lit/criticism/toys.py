@@ -41,6 +41,10 @@ class Null:
     moments: dict[str, tuple[float, float]]
     largest: list[float]
 
+    def expected(self, candidate: Candidate) -> float:
+        """Mean statistic without the effect, at least its degrees of freedom."""
+        return max(float(candidate.degrees), self.moments.get(candidate.effect.name, (0.0, 0.0))[0])
+
     def p_value(self, candidate: Candidate) -> float:
         """Of the gamma distribution or of χ², whichever is larger. A toy's statistic is that of its best shape, too.
 

@@ -53,7 +53,9 @@ def screened() -> list[Screened]:
         shape = {"decay": 0.15} if name == "irf_tail" else {}
         kept = {"time_offset": 0.0021, "ghost_pulse": NAN}.get(name, rng.uniform(0.1, 1))
         found.append(
-            Screened(name, statistic, math.exp(-statistic / 2), kept, 1 + k, statistic / 2 - 3, {"fraction": 0.19}, shape, limit)
+            Screened(
+                name, statistic, math.exp(-statistic / 2), kept, 1 + k, statistic / 2 - 3, {"fraction": 0.19}, shape, limit, 1.0 + k
+            )
         )
     return found
 
@@ -146,7 +148,7 @@ CASES = {
         ],
         extended=Scores(NAN, NAN, NAN, NAN),
         untouched_test={"base": Scores(NAN, NAN, NAN, NAN), "extended": Scores(NAN, NAN, NAN, NAN)},
-        screened=[Screened("pile_up", NAN, NAN, NAN, 1, NAN, {"detections": NAN}, {}, {"detections": math.inf})],
+        screened=[Screened("pile_up", NAN, NAN, NAN, 1, NAN, {"detections": NAN}, {}, {"detections": math.inf}, 1.0)],
         profiles=[Profile("time", "bins", np.arange(4.0), np.full(3, NAN), np.array([1.0, NAN, 4.0]))],
         witness={
             "direct_pulse_counts": 0,

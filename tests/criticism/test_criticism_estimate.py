@@ -249,8 +249,9 @@ def test_screened_in_units_of_the_parameters():
     found = _screened(candidate, null)
     assert found.one_step["drift"] == pytest.approx(0.05 * (9 / 5) ** 0.5)
     assert found.p_value == pytest.approx(null.p_value(candidate))
+    assert found.expected == 10, "toys show twice its degrees of freedom"
     hot = effect_of("hot_spots", SCAN)
     error = torch.tensor([float("nan"), 2.0, 2.0])
     found = _screened(Candidate(hot, 9.0, 0.1, 1.0, 1.0, torch.zeros(3), error, {}, None), None)
-    assert (found.degrees, found.one_step) == (2, {})
+    assert (found.degrees, found.expected, found.one_step) == (2, 2, {})
     assert found.detectable["extra"] == pytest.approx(5 * hot.declared["extra"].scale * 2)
