@@ -105,12 +105,12 @@ def confusion(cases: list[dict]) -> list[tuple[str, dict[str, int]]]:
     return sorted((h, dict(s)) for h, s in table.items())
 
 
-def line(name: str, case: dict) -> str:
+def line(case: dict, mark: str) -> str:
     hidden = ", ".join(f"{n} ({STRENGTHS[s]})" for n, s in zip(case["spec"]["effects"], case["spec"]["strengths"], strict=True))
     said = ", ".join("/".join(group(case, n)) for n in case["named"]) or "–"
     wrong = "; ".join(f"{q} {s:+.1f} σ, {r:+.0%}" for found in case["errors"].values() for q, (s, r) in found.items())
     cells = (
-        case["spec"]["scene"], f"{case['spec']['level']:g}", hidden or "nothing", true_statistic(case),
+        case["spec"]["scene"] + mark, f"{case['spec']['level']:g}", hidden or "nothing", true_statistic(case),
         said, case["unexplained"] or "–", f"{case['gain']:.0f}/{case['oracle']:.0f}" if hidden else "", wrong,
         f"{case['ratio']:.3f}", f"{case['seconds']:.0f}",
     )  # fmt: skip
@@ -118,12 +118,18 @@ def line(name: str, case: dict) -> str:
 
 
 def tables(store: Path) -> str:
-    """All tables as Markdown, of the outcomes of ``blind.py table``."""
-    named = {f.stem: json.loads(f.read_text()) for f in sorted(store.glob("[npsu]*_[0-9]*.json"))}
+    """All tables as Markdown, of the outcomes of ``blind.py table``.
+
+    Outcomes that an older version has left in ``older`` stand in for captures that were not run since; they are marked.
+    """
+    now = {f.stem: json.loads(f.read_text()) for f in store.glob("[npsu]*_[0-9]*.json")}
+    older = {f.stem: json.loads(f.read_text()) for f in (store / "older").glob("[npsu]*_[0-9]*.json")}
+    named = dict(sorted((older | now).items()))
     cases = list(named.values())
     out = [f"{len(cases)} captures, {sum(c['seconds'] for c in cases) / 3600:.1f} hours of one core.", ""]
-    out += ["| what | required | measured (95 % interval) |", "|---|---|---|"]
-    out += [f"| {what} | {required} | {value} |" for what, required, value in rows(cases)]
+    out += ["| what | required | measured (95 % interval) | without † |", "|---|---|---|---|"]
+    pairs = zip(rows(cases), rows([named[name] for name in now]), strict=True)
+    out += [f"| {what} | {required} | {value} | {new} |" for (what, required, value), (_, _, new) in pairs]
     out += ["", "## Confusion: what was hidden, what was said first", ""]
     out += ["| hidden | said first (number of captures) |", "|---|---|"]
     for hidden, said in confusion(cases):
@@ -133,5 +139,5 @@ def tables(store: Path) -> str:
     heads = "scene | counts | hidden | true statistic | said | unexplained | nats / oracle's | parameter errors | base / noise | s"
     out += [f"| {heads} |"]
     out += ["|---" * 10 + "|"]
-    out += [line(name, case) for name, case in named.items()]
+    out += [line(case, "" if name in now else " †") for name, case in named.items()]
     return "\n".join(out) + "\n"
