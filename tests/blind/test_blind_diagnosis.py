@@ -60,6 +60,12 @@ def test_a_gap_in_the_time_codes_is_not_called_a_ripple():
 
 
 @pytest.mark.slow
+def test_a_detector_that_saturates_is_not_called_a_dark_wall():
+    """It loses most where the scene is bright: a smooth map over the wall explains it, but the map follows the count rate."""
+    check(run_case(Spec("default", ("saturation",), (3,), 1500, 4108), QUICK, oracle=False))
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.xfail(reason=HARD[name], strict=False) if name in HARD else ()) for name in CASES]
 )
