@@ -29,6 +29,7 @@ class Uncertainty:
     """
 
     def __init__(self, fit: SurfelFit, spots: Tensor, counts: Tensor, block: Tensor, share: float = 1.0) -> None:
+        self.fitted = len(fit.train) / fit.capture.n_spots
         self.effects = [e for e in fit.extension.effects if not e.per_spot]
         if not self.effects:
             return
@@ -53,7 +54,7 @@ class Uncertainty:
         largest component is not settled. ``again``: the same effect in a fit from new seeds; the difference is an error, too.
         """
         if effect.per_spot:
-            return _spread(effect)
+            return _spread(effect, self.fitted)
         offset = sum(e_size(e) for e in self.effects[: self.effects.index(effect)])
         variance, axes = torch.linalg.eigh(self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)])
         steps = REACH * variance.clamp_min(0).sqrt() * axes
@@ -83,9 +84,12 @@ def e_size(effect: Effect) -> int:
     return sum(p.size for p in effect.declared.values())
 
 
-def _spread(effect: Effect) -> dict[str, Estimate]:
-    fitted = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
-    return {
-        name: Estimate(float(q.value.detach()), float(q.value.detach()) / (2 * fitted) ** 0.5, q.unit)
-        for name, q in effect.quantities().items()
-    }
+def _spread(effect: Effect, share: float) -> dict[str, Estimate]:
+    """Of a per-spot effect, from the spots that have a number; ``share`` of all spots were fitted. Numbers of spots are for all."""
+    known = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
+    found = {}
+    for name, (quantity, unit, spots) in effect.quantities().items():
+        value = float(quantity.detach())
+        error = value**0.5 if spots else value / (2 * known) ** 0.5
+        found[name] = Estimate(value / share, error / share, unit) if spots else Estimate(value, error, unit)
+    return found

@@ -43,10 +43,11 @@ class Parameter:
 
 
 class Quantity(NamedTuple):
-    """A number worth reporting, differentiable by the effect's parameters."""
+    """A number worth reporting, differentiable by the effect's parameters; ``spots``: it counts spots of the scan."""
 
     value: Tensor
     unit: str
+    spots: bool = False
 
 
 class Effect(nn.Module, Hooks):

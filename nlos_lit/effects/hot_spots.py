@@ -43,5 +43,5 @@ class HotSpots(Effect):
         number = hot.sum()
         return {
             "level": Quantity((extra * hot).sum() / number.clamp_min(1), "counts/bin"),
-            "number": Quantity(number, "1"),
+            "number": Quantity(number, "1", spots=True),
         }

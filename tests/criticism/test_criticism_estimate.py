@@ -26,7 +26,7 @@ SCAN = Scan.of(capture_of(scattered(12)))
 
 def known(effects: list[Effect], covariance: Tensor) -> Uncertainty:
     found = object.__new__(Uncertainty)
-    found.effects, found.covariance = effects, covariance.double()
+    found.effects, found.covariance, found.fitted = effects, covariance.double(), 0.75
     return found
 
 
@@ -82,6 +82,15 @@ def test_a_width_is_as_certain_as_its_spots_are_many():
     found = known([], torch.zeros(0, 0)).parameters(jitter)["sigma"]
     assert found.value == pytest.approx(0.01, rel=1e-3)
     assert found.stderr == pytest.approx(0.01 / 4, rel=1e-3)
+
+
+def test_hot_spots_are_counted_for_the_whole_scan():
+    """Nine of 2 counts a bin among the fitted three quarters: twelve, give or take √9/0.75; their level is 2."""
+    extra = torch.zeros(12)
+    extra[:9] = 2.0
+    found = known([], torch.zeros(0, 0)).parameters(effect_of("hot_spots", SCAN, extra=extra))
+    assert (found["number"].value, found["number"].stderr) == (pytest.approx(12), pytest.approx(4))
+    assert (found["level"].value, found["level"].stderr) == (pytest.approx(2), pytest.approx(2 / 18**0.5))
 
 
 def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, Tensor, Tensor]:
