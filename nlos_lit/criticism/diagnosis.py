@@ -119,7 +119,8 @@ def weighed(candidate: Candidate, null: Null | None, level: float) -> tuple[floa
 
 def alternatives(turn: Turn, accepted: list[Turn]) -> list[str]:
     """A turn's group without what is needed beside its effect: that is no other name for it."""
-    return [name for name in turn.group if name not in {t.accepted.name for t in accepted}]
+    names = {t.accepted.name for t in accepted}
+    return [name for name in turn.group if name not in names]
 
 
 def _of_another_form(form: Form) -> str:

@@ -8,6 +8,7 @@ import math
 import torch
 from torch import Tensor
 
+from nlos_lit.criticism.joint_step import shift
 from nlos_lit.criticism.result import Estimate
 from nlos_lit.criticism.screen import Projector
 from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
@@ -59,24 +60,25 @@ class Uncertainty:
         variance, axes = torch.linalg.eigh(self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)])
         steps = REACH * variance.clamp_min(0).sqrt() * axes
         moved = [[_displaced(effect, sign * step) for sign in (1, -1)] for step in steps.T.float()]
+        elsewhere = {} if again is None else _values(again)
         found = {}
         for name, quantity in effect.quantities().items():
             value = float(quantity.value.detach())
             errors = [max(abs(side[name] - value) for side in both) / REACH for both in moved]
-            if again is not None:
-                errors.append(abs(float(again.quantities()[name].value.detach()) - value))
+            errors.append(abs(elsewhere.get(name, value) - value))
             found[name] = Estimate(value, math.hypot(*errors), quantity.unit)
         return found
 
 
-@torch.no_grad()
 def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
     """Quantities with all stored values moved by ``step``, without regard to bounds."""
     moved = copy.deepcopy(effect)
-    for p in [*moved.amplitudes, *moved.shapes]:
-        getattr(moved, f"raw_{p.name}").add_(step[: p.size])
-        step = step[p.size :]
-    return {name: float(quantity.value) for name, quantity in moved.quantities().items()}
+    shift(moved, step, shapes=True)
+    return _values(moved)
+
+
+def _values(effect: Effect) -> dict[str, float]:
+    return {name: float(quantity.value.detach()) for name, quantity in effect.quantities().items()}
 
 
 def e_size(effect: Effect) -> int:

@@ -44,13 +44,19 @@ def move_base(fit: SurfelFit, present: Extension, step: Tensor) -> None:
             rest = _add(effect, rest, shapes=True)
 
 
-@torch.no_grad()
 def _add(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
-    """Add the first numbers of ``step`` to the stored values; the numbers that are left."""
+    """:func:`shift`, within bounds."""
+    rest = shift(effect, step, shapes)
+    effect.clamp()
+    return rest
+
+
+@torch.no_grad()
+def shift(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
+    """Add the first numbers of ``step`` to the stored values, without regard to bounds; the numbers that are left."""
     for p in effect.amplitudes + (effect.shapes if shapes else []):
         getattr(effect, f"raw_{p.name}").add_(step[: p.size])
         step = step[p.size :]
-    effect.clamp()
     return step
 
 
