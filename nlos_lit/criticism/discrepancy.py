@@ -22,6 +22,7 @@ from nlos_lit.effects.base import Effect
 from nlos_lit.effects.scan import Scan
 
 BANDS = {"time": 40, "wall": 8, "scan": 64, "rate": 10}
+RETAINED = 1e-3  # share of a combination's information that the base must leave
 SMOOTH = 0.5  # share of a per-spot effect's gain that neighbours have in common, from which on its numbers are not independent
 
 
@@ -38,12 +39,22 @@ class Discrepancy:
 
 
 def discrepancies(problem: Problem, projector: Projector, scan: Scan, per_spot: Sequence[Effect] = ()) -> list[Discrepancy]:
-    """One for each axis, and two for each per-spot effect; the largest gain first."""
+    """One for each axis, and two for each per-spot effect; the largest gain first.
+
+    Stretches of a raster are stripes of the wall: a map of the wall that holds nothing beyond the order of the scan is left out.
+    """
     root = problem.expected.sqrt()
-    found = [_test(root, problem, projector, axis, scan) for axis in BANDS]
+    asked = {"": (root, tuple(BANDS))}
     for effect in per_spot:
-        column = weighted_columns(problem, effect)[:, 0].view(root.shape)
-        found += [_test(column, problem, projector, axis, scan, effect.name) for axis in ("scan", "wall")]
+        asked[effect.name] = weighted_columns(problem, effect)[:, 0].view(root.shape), ("scan", "wall")
+    found = []
+    for of, (column, axes) in asked.items():
+        tests = {axis: _test(column, problem, projector, (axis,), scan, of) for axis in axes}
+        if tests["wall"].gain > tests["scan"].gain > SMOOTH * tests["wall"].gain:
+            both = _test(column, problem, projector, ("scan", "wall"), scan, of)
+            if both.gain <= tests["scan"].gain:
+                del tests["wall"]
+        found += tests.values()
     return sorted(found, key=lambda d: -d.gain)
 
 
@@ -66,27 +77,38 @@ def bands(problem: Problem, axis: str, scan: Scan) -> Tensor:
     return torch.argsort(torch.argsort(total)) * number // len(total)
 
 
-def _test(column: Tensor, problem: Problem, projector: Projector, axis: str, scan: Scan, of: str = "") -> Discrepancy:
-    """``column`` ``[S, T]``, with a coefficient of its own in every band of the axis."""
-    names, band = torch.unique(bands(problem, axis, scan), return_inverse=True)
-    onehot = torch.nn.functional.one_hot(band, len(names)).float()
-    gain, statistic, p = flexible(column[:, :, None] * (onehot[None] if axis == "time" else onehot[:, None]), problem, projector)
-    return Discrepancy(axis, gain, statistic, len(names), p, of)
+def _test(column: Tensor, problem: Problem, projector: Projector, axes: Sequence[str], scan: Scan, of: str) -> Discrepancy:
+    """``column`` ``[S, T]``, with a coefficient of its own in every band of every axis."""
+    parts = []
+    for axis in axes:
+        names, band = torch.unique(bands(problem, axis, scan), return_inverse=True)
+        onehot = torch.nn.functional.one_hot(band, len(names)).float()
+        parts.append(column[:, :, None] * (onehot[None] if axis == "time" else onehot[:, None]))
+    return Discrepancy("+".join(axes), *flexible(torch.cat(parts, 2), problem, projector), of)
 
 
-def flexible(columns: Tensor, problem: Problem, projector: Projector) -> tuple[float, float, float]:
-    """Gain (nats, cross-validated over random spots), statistic and p-value of weighted columns ``[S, T, k]``."""
+def flexible(columns: Tensor, problem: Problem, projector: Projector) -> tuple[float, float, int, float]:
+    """Gain (nats, cross-validated over random spots), statistic, degrees and p-value of weighted columns ``[S, T, k]``.
+
+    Combinations that the base can imitate (``RETAINED``) are left out: their scores and information are rounding errors.
+    """
     spots, bins, k = columns.shape
-    z = projector.off(columns.reshape(-1, k)).view(spots, bins, k)
+    raw = columns.reshape(-1, k)
+    z = projector.off(raw).view(spots, bins, k)
+    scale = raw.double().square().sum(0).clamp_min(1e-30).rsqrt()
     folds = torch.from_numpy(np.random.default_rng(1).permutation(spots) % FOLDS)
-    score = torch.einsum("sbk,sb->sk", z, projector.residual.view(spots, bins)).double()
-    s = torch.zeros(FOLDS, k, dtype=torch.float64).index_add_(0, folds, score)
-    f = torch.stack([z[folds == b].reshape(-1, k).T @ z[folds == b].reshape(-1, k) for b in range(FOLDS)]).double()
+    score = torch.einsum("sbk,sb->sk", z, projector.residual.view(spots, bins)).double() * scale
+    information = torch.einsum("sbk,sbl->skl", z, z).double() * scale[:, None] * scale
+    values, vectors = torch.linalg.eigh(information.sum(0))
+    kept = vectors[:, values > RETAINED]
+    s = torch.zeros(FOLDS, k, dtype=torch.float64).index_add_(0, folds, score) @ kept
+    f = kept.T @ torch.zeros(FOLDS, k, k, dtype=torch.float64).index_add_(0, folds, information) @ kept
     total = f.sum(0)
-    floor = torch.diag(1e-6 * total.diagonal().mean() * torch.ones(k, dtype=torch.float64))
+    floor = torch.diag(RETAINED * total.diagonal())
     gain = 0.0
     for b in range(FOLDS):
         step = torch.linalg.solve(total - f[b] + floor, s.sum(0) - s[b])
         gain += float(step @ s[b] - 0.5 * step @ f[b] @ step)
-    statistic = float(s.sum(0) @ torch.linalg.solve(total + floor, s.sum(0)))
-    return gain, statistic, float(stats.chi2.sf(statistic, k))
+    statistic = float(s.sum(0) @ torch.linalg.solve(total, s.sum(0)))
+    degrees = kept.shape[1]
+    return gain, statistic, degrees, float(stats.chi2.sf(statistic, degrees))

@@ -23,7 +23,7 @@ from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.smooth import SmoothEffect
 
 BANDS = 8
-LIMITS = {"time": (0.5, 1e-6), "rate": (0.67, 1e-3)}  # share of what the effect itself changes, and p-value, that are too much
+LIMITS = {"time": (0.5, 1e-6), "rate": (0.85, 1e-3)}  # share of what the effect itself changes, and p-value, that are too much
 POWERS, DRAWS = 2, 4000  # of the logarithm of the count rate; of random maps
 
 
@@ -45,7 +45,7 @@ class Form:
 
     @property
     def wrong(self) -> bool:
-        """The strength varies by more than 70 % (root mean square) of itself, or two thirds of the map follow the count rate."""
+        """The strength varies by more than 70 % (root mean square) of itself, or 85 % of the map follow the count rate."""
         share, level = LIMITS[self.axis]
         return self.p_value < level and self.gain > share * self.own
 
@@ -68,7 +68,7 @@ def _over_time(problem: Problem, projector: Projector, effect: Effect, change: T
     weight = change.square().sum(0).cumsum(0)
     band = (weight / weight[-1].clamp_min(1e-30) * BANDS).long().clamp_max(BANDS - 1)
     columns = change[:, :, None] * torch.nn.functional.one_hot(band, BANDS)
-    gain, statistic, p = flexible(columns[..., band.unique()], problem, projector)
+    gain, statistic, _, p = flexible(columns[..., band.unique()], problem, projector)
     return Form(effect.name, gain, float(change.square().sum()) / 2, statistic, p)
 
 

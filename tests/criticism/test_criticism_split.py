@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
 from criticism_scenes import FORWARD_MODE, GATE, capture_of, drawn, problem_of, raster, scattered, surfels
 from scipy import ndimage
 
-from nlos_lit.criticism.discrepancy import BANDS, bands, discrepancies
+from nlos_lit.criticism.discrepancy import BANDS, bands, discrepancies, flexible
 from nlos_lit.criticism.screen import FOLDS, Projector
 from nlos_lit.criticism.sensitivity import Problem, build_problem
 from nlos_lit.criticism.split import split_spots
@@ -142,3 +144,29 @@ def test_bands_follow_irregular_spots():
     problem = problem_of(torch.arange(50), flat, flat, flat)
     band = bands(problem, "wall", Scan.of(scene))
     assert 0 <= int(band.min()) <= int(band.max()) < 64
+
+
+@FORWARD_MODE
+def test_stretches_of_a_raster_are_not_taken_for_a_map_of_the_wall(scene):
+    """The second half of a raster is half of the wall, too (and gains more as such here); a checkerboard is the wall's alone."""
+    raster = dataclasses.replace(scene, scan_order=np.arange(scene.n_spots))
+    scan = Scan.of(raster)
+    cell = ((scan.places[0] + 1) * 4).long().clamp_max(7).sum(1)
+    for factor, axis in ((1 + 0.2 * torch.sign(scan.rank), "scan"), (1 + 0.2 * (1 - 2.0 * (cell % 2)), "wall")):
+        problem, _ = weighed(raster, factor[:, None], seed=1)
+        found = discrepancies(problem, Projector(problem), scan)
+        assert found[0].axis == axis
+        assert ("wall" in {d.axis for d in found}) is (axis == "wall")
+
+
+@FORWARD_MODE
+def test_what_the_base_can_imitate_is_no_degree_of_freedom(scene):
+    """The common factor of all counts is the scene's own; rounding errors of its score may not be taken for a gain."""
+    problem, _ = weighed(scene, 1.3)
+    projector, (spots, bins) = Projector(problem), problem.expected.shape
+    imitated = problem.nuisance[:, :1].view(spots, bins, 1)
+    root = problem.expected.sqrt()[:, :, None]
+    late = root * (torch.arange(bins) > bins // 2)[None, :, None]
+    alone, both = (flexible(torch.cat(c, 2), problem, projector) for c in ([late], [late, imitated]))
+    assert (alone[2], both[2]) == (1, 1)
+    assert both[:2] == pytest.approx(alone[:2], rel=0.05, abs=0.05)
