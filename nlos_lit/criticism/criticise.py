@@ -29,7 +29,6 @@ from nlos_lit.surfel_fit import SurfelFit
 log = logging.getLogger(__name__)
 WORK = 1e12  # multiplications of the nuisance columns with each other, some 40 s of one core
 WELL = 0.01  # retained information from which on an effect counts as well identifiable
-STEEP = 0.3  # power of what is missing by which less identifiable ones must gain more
 Rebuild = Callable[[Extension, int], SurfelFit]
 
 
@@ -139,7 +138,6 @@ def turn(
 ) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
-    Rivals are the wanted effects, and those that promise more but are too like the base to be wanted by themselves.
     The control goes through the same without another effect (as it is, refitted, or rebuilt with another random seed).
 
     Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
@@ -158,8 +156,7 @@ def turn(
     far_off = misfit > s.far_off * noise
     if not wanted and not far_off:
         return Turn(candidates, rest, [], None, [])
-    promising = [c for c in possible if c in wanted or (wanted and c.p_value < s.level and c.gain > wanted[0].gain)]
-    rivals = [c for c in promising[: s.rivals] if c.gain > s.hopeless * promising[0].gain]
+    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
     own = partial(refit_with, fit, [], s.steps, seed, seen.own)
     controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
@@ -170,7 +167,7 @@ def turn(
         tries.append((c, again, log_likelihood(again, split.select)))
     weight = len(split.fit) / tested  # of a prediction for the tested spots
     tries.sort(key=lambda t: -float(t[2].sum()) - weight * t[0].gain)
-    finalists = [(c, again.extension) for k, (c, again, _) in enumerate(tries) if k < s.finalists or c is promising[0]]
+    finalists = [(c, again.extension) for k, (c, again, _) in enumerate(tries) if k < s.finalists or c is wanted[0]]
     if far_off:
         tried = {c.effect.name for c, _ in finalists}
         bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
@@ -187,7 +184,7 @@ def turn(
     reference, block = best_likelihood(controls, split), split.block[split.select]
     trials = best_of_each([Trial(c, again, compare(reference, value, block), value, weight * c.gain) for c, again, value in tries])
     share = len(split.select) / tested
-    held = [t for t in trials if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over))]
+    held = [t for t in trials if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over, rebuilt=True))]
     if not held:
         return Turn(candidates, rest, trials, None, [], controls)
     best = choose(held, block)
@@ -209,14 +206,15 @@ def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
     return max(found, key=lambda values: float(values.sum()))
 
 
-def needed(candidate: Candidate, s: CriticismSettings, over: float) -> float:
-    """Nats over the tested spots that an effect must gain, ``over`` being the misfit there.
+def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: bool = False) -> float:
+    """Nats over the tested spots that an effect must promise, or gain once the scene is ``rebuilt``; ``over``: the misfit there.
 
     The less of an effect the base leaves over, the more easily the base's own approximations look like it: below ``WELL`` retained
-    information it must gain more (captures without effects: at most 43 nats where 0.1 % are retained, 53 where 0.02 % are).
+    information the rebuilt scene must gain more, by the root of what is missing.
     """
     least = s.least_gain if candidate.effect.moves_light else s.least_shape
-    return max(least * max(1.0, (WELL / max(candidate.retained, 1e-6)) ** STEEP), s.least_share * over)
+    scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) ** 0.5 if rebuilt else 1.0
+    return max(least * scarce, s.least_share * over)
 
 
 def misfit_and_noise(fit: SurfelFit, split: Split) -> tuple[float, float]:

@@ -75,5 +75,5 @@ def diagnose(
         other = found.turns[0].controls[-1] if found.turns[0].controls else None
         vary = partial(numerics, pipeline, capture, split, image, base, seed, other)
         checks = steps("check", "varying the numerics", "numerics", vary)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - began + steps.earlier
     return assemble(capture, found, split, scan, options, null, checks, name, seconds, seed), found

@@ -43,6 +43,7 @@ class Steps:
             )
         self.shared: dict[str, Any] = {}
         self.began, self.taken, self.ahead = time.monotonic(), {}, dict.fromkeys(SHARE, 0)
+        self.earlier = 0.0  # seconds that kept results took when they were made
 
     def share(self, objects: Mapping[str, Any]) -> None:
         """Large objects that every result refers to; they are kept once, by whoever made them, not with each result."""
@@ -76,14 +77,17 @@ class Steps:
         file = None if self.folder is None else self.folder / f"{name}.pickle"
         if file is not None and file.exists():
             self.ahead[kind] = max(0, self.ahead[kind] - 1)
-            return self._load(file)
+            took, result = self._load(file)
+            self.earlier += took
+            return result
         self.report(text, time.monotonic() - self.began, self.left())
         began = time.monotonic()
         result = make()
-        self.taken.setdefault(kind, []).append((time.monotonic() - began) / at_once)
+        took = (time.monotonic() - began) / at_once
+        self.taken.setdefault(kind, []).append(took)
         self.ahead[kind] = max(0, self.ahead[kind] - 1)
         if file is not None:
-            self._keep(file, result)
+            self._keep(file, (took, result))
         return result
 
     def _keep(self, file: Path, result: Any) -> None:

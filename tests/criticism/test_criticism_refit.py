@@ -147,15 +147,18 @@ def test_significance_is_holms():
 
 
 def test_what_is_significant_must_gain_enough():
-    """25 nats for what moves or scales the light, as the base's own errors do; 15 for all others; more where little is retained."""
+    """25 nats for what moves or scales the light, as the base's own errors do; 15 for all others; more of a rebuilt scene where
+    little is retained."""
     settings = CriticismSettings()
-    few = [candidate("vignetting", gain=26), candidate("power_drift", gain=24), candidate("time_offset", gain=37, retained=0.0025)]
-    assert [c.effect.name for c in significant(few, settings, 0.0)] == ["vignetting"]
+    few = [candidate("vignetting", gain=26), candidate("power_drift", gain=24), candidate("time_offset", gain=40, retained=0.0025)]
+    assert [c.effect.name for c in significant(few, settings, 0.0)] == ["vignetting", "time_offset"]
     counted = [candidate("irf_tail", gain=16), candidate("pile_up", gain=14), candidate("higher_order_bounces", gain=16)]
     assert [c.effect.name for c in significant(counted, settings, 0.0)] == ["irf_tail", "higher_order_bounces"]
-    assert needed(few[2], settings, 0.0) == pytest.approx(25 * 4**0.3)  # a quarter of WELL retained: half as much again
+    assert needed(few[2], settings, 0.0) == 25
+    assert needed(few[2], settings, 0.0, rebuilt=True) == pytest.approx(25 * 2)  # a quarter of WELL retained: twice as much
+    assert needed(few[2], settings, 4000.0, rebuilt=True) == pytest.approx(80)
     assert needed(few[0], settings, 1350.0) == pytest.approx(27)  # 2 % of the misfit
-    assert significant(few + counted, settings, 1350.0) == []
+    assert significant(few + counted, settings, 2050.0) == []
 
 
 def test_the_better_trial_of_an_effect_stands_for_it():

@@ -50,6 +50,15 @@ def test_a_step_is_done_once(tmp_path):
     assert len(made) == 2
 
 
+def test_seconds_of_kept_steps_count(tmp_path):
+    steps = Steps(folder=tmp_path)
+    steps("fit", "fitting", "base", lambda: time.sleep(0.05))
+    assert steps.earlier == 0
+    again = Steps(folder=tmp_path)
+    again("fit", "fitting", "base", lambda: None)
+    assert 0.05 <= again.earlier < 5
+
+
 def test_what_is_interrupted_is_not_kept(tmp_path):
     def broken():
         raise KeyboardInterrupt
