@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import torch
 
-from nlos_lit.criticism.discrepancy import Discrepancy, discrepancies, smooth
+from nlos_lit.criticism.discrepancy import Discrepancy, counted, discrepancies, smooth
 from nlos_lit.criticism.form import Form, forms_of
 from nlos_lit.criticism.joint_step import copy_effects, null_of
 from nlos_lit.criticism.needless import drop_needless
@@ -141,6 +141,7 @@ def turn(
     The control goes through the same without another effect (as it is, refitted, or rebuilt with another random seed).
 
     Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
+    Else, where a function of the count rate says more than any effect, the counting is none that the registry knows: no rivals.
     """
     number = len(fit.extension.effects) + 1
     steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
@@ -154,7 +155,7 @@ def turn(
     possible = [c for c in candidates if not smooth(rest, c.effect.name, c.gain)]
     wanted = significant(possible, s, over)
     far_off = misfit > s.far_off * noise
-    if not wanted and not far_off:
+    if not far_off and (not wanted or counted(rest) > wanted[0].gain + s.least_gain):
         return Turn(candidates, rest, [], None, [])
     rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))

@@ -63,6 +63,11 @@ def smooth(found: list[Discrepancy], name: str, gain: float) -> bool:
     return any(d.of == name and d.gain > SMOOTH * gain for d in found)
 
 
+def counted(found: list[Discrepancy]) -> float:
+    """Nats that a function of the count rate gains; of an effect of the registry it never holds as much as the effect itself."""
+    return next(d.gain for d in found if d.axis == "rate")
+
+
 def bands(problem: Problem, axis: str, scan: Scan) -> Tensor:
     """``[S]`` (wall, scan, rate) or ``[T]`` (time) band of each spot or bin."""
     number = BANDS[axis]

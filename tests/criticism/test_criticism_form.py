@@ -7,12 +7,12 @@ import torch
 from criticism_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, surfels
 
 from nlos_lit.criticism.criticise import CriticismSettings, look
-from nlos_lit.criticism.discrepancy import discrepancies, smooth
+from nlos_lit.criticism.discrepancy import counted, discrepancies, smooth
 from nlos_lit.criticism.form import Form, forms_of
-from nlos_lit.criticism.screen import Projector, screen
+from nlos_lit.criticism.screen import FOLDS, Projector, screen
 from nlos_lit.criticism.sensitivity import build_problem
 from nlos_lit.criticism.split import split_spots
-from nlos_lit.effects import Effect, Extension, Scan
+from nlos_lit.effects import EFFECTS, Effect, Extension, Scan
 
 pytestmark = FORWARD_MODE
 
@@ -100,6 +100,20 @@ def test_a_wall_that_is_dark_where_the_scene_is_bright_belongs_to_the_counting(s
         assert (found["rate"].gain > 0.9 * found["rate"].own) is wrong
     assert found["rate"].own == pytest.approx(found["time"].own, rel=1e-5)
     assert "rate" not in forms(scene, effect_of("vignetting", scan, strength=0.3), []), "one number is no map"
+
+
+def test_a_function_of_the_count_rate_says_more_than_any_effect_only_where_it_is_the_cause(scene):
+    """A detector that loses counts where there are many, and a wall that is dark in places."""
+    scan, model = Scan.of(scene), surfels(scene)
+    total = model.expected(torch.arange(scene.n_spots)).sum(1, keepdim=True)
+    values = torch.zeros(effect_of("wall_reflectance", scan).functions.shape[1])
+    values[:4] = torch.tensor([0.1, -0.2, 0.3, 0.1])
+    wall = effect_of("wall_reflectance", scan, gain_map=values)
+    for inside, factor, rate in (([], 1 / (1 + 3 * (total / total.mean()) ** 2), True), ([wall], 1.0, False)):
+        problem, projector = problem_with(scene, [], inside, factor)
+        best = screen(problem, projector, [e(scan) for e in EFFECTS], torch.arange(scene.n_spots) % FOLDS)[0]
+        assert best.effect.name == "wall_reflectance"
+        assert (counted(discrepancies(problem, projector, scan)) > best.gain + CriticismSettings().least_gain) is rate
 
 
 def test_a_delay_that_neighbours_share_is_no_jitter(scene):

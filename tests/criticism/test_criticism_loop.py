@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import torch
 from criticism_scenes import BLOCK, candidate, capture_of, effect_of, per_spot, scattered
 from torch import Tensor
@@ -12,6 +13,7 @@ from torch import Tensor
 from nlos_lit.criticism import criticise as loop
 from nlos_lit.criticism import needless
 from nlos_lit.criticism.criticise import CriticismSettings, Findings, Look, Trial, Turn, criticise
+from nlos_lit.criticism.discrepancy import Discrepancy
 from nlos_lit.criticism.form import Form
 from nlos_lit.criticism.needless import drop_needless
 from nlos_lit.criticism.refit import Comparison
@@ -53,6 +55,27 @@ def with_table(monkeypatch, table: dict[str, float]) -> None:
         return per_spot(0, 1) + sum(per_spot(table[n], 0.1) for n in sorted(fit.names))
 
     monkeypatch.setattr(needless, "log_likelihood", likelihood)
+
+
+def test_nothing_is_tried_where_the_count_rate_says_more(monkeypatch):
+    class Tried(Exception):
+        pass
+
+    def refit(*_):
+        raise Tried
+
+    def one_turn(rate: float, misfit: float) -> Turn:
+        look = Look([candidate("pile_up", 1e-9, gain=100)], [Discrepancy("rate", rate, 2 * rate, 9, 1e-9)], torch.zeros(1))
+        monkeypatch.setattr(loop, "look", lambda *_: look)
+        monkeypatch.setattr(loop, "misfit_and_noise", lambda *_: (misfit, 1000.0))
+        monkeypatch.setattr(loop, "tested_spots", lambda *_: 300)
+        monkeypatch.setattr(loop, "refit_with", refit)
+        return loop.turn(FakeFit(()), rebuilt, SPLIT, SCAN, CriticismSettings(), 0, Steps())
+
+    assert one_turn(130, 100).trials == []
+    for rate, misfit in ((120, 100), (130, 200)):  # within least_gain; a base too far off to believe the tests around it
+        with pytest.raises(Tried):
+            one_turn(rate, misfit)
 
 
 def test_needless_effects_are_dropped(monkeypatch):
