@@ -53,6 +53,11 @@ def all_named(case: dict) -> bool:
     return set(case["hidden"]) <= said
 
 
+def overnamed(case: dict) -> bool:
+    """Something is named that is not hidden, nor any of its group."""
+    return any(not set(group(case, name)) & set(case["hidden"]) for name in case["named"])
+
+
 def missed_statistic(case: dict) -> float:
     """What the oracle, told every hidden effect, gains beyond what was named: on the scale of the true statistic."""
     return case["statistic"] * (1 - case["gain"] / case["oracle"]) if case["oracle"] else 0.0
@@ -75,6 +80,7 @@ def rows(cases: list[dict]) -> list[tuple[str, str, str]]:
     checks = [ok for c in alone for ok in parameters_right(c)]
     shares = [c["gain"] / c["oracle"] for c in seen]
     shown = [c for c in by["pair"] if all_named(c) or missed_statistic(c) > STRONG]
+    held = by["single"] + by["pair"]
     unknown = by["unknown"]
     axis = [c for c in unknown if c["unexplained"] == c["axis"] and not c["named"]]
     unnamed = [c for c in unknown if not c["named"]]
@@ -85,6 +91,7 @@ def rows(cases: list[dict]) -> list[tuple[str, str, str]]:
         ("… named first itself", "", interval(len(alone), len(seen))),
         ("the same below a true statistic of 50", "", interval(sum(map(first_right, weak)), len(weak))),
         ("false alarms on effect-free captures", "≤ 5 %", interval(sum(bool(c["named"]) for c in by["null"]), len(by["null"]))),
+        ("nothing else named beside one or two hidden effects", "", interval(sum(not overnamed(c) for c in held), len(held))),
         ("parameters within 3 reported standard errors or 15 %", "≥ 90 %", interval(sum(checks), len(checks))),
         ("at least 80 % of the oracle's held-out gain", "", interval(sum(s >= 0.8 for s in shares), len(shares)) + share),
         ("two effects at once: both named", "≥ 85 %", interval(sum(map(all_named, by["pair"])), len(by["pair"]))),

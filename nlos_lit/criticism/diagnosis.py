@@ -134,12 +134,17 @@ def _of_another_form(form: Form) -> str:
 
 
 def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
-    """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain."""
+    """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain.
+
+    A map that was taken back because it follows the count rate says so itself; another effect of the wrong form only where nothing
+    else does.
+    """
     rest = [d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain]
     worst = max(rest, key=lambda d: d.gain, default=None)
     if found.wrong is not None:
         dominates = worst is not None and _outweighs(worst, found, split, settings)
-        return Verdicts(Unexplained(True, found.wrong.axis, found.wrong.statistic, found.wrong.p_value), dominates)
+        cause = found.wrong if worst is None or found.wrong.axis == "rate" else worst
+        return Verdicts(Unexplained(True, cause.axis, cause.statistic, cause.p_value), dominates)
     if worst is None:
         calm = max(found.left, key=lambda d: d.gain)
         return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)

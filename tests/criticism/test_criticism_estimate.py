@@ -14,6 +14,7 @@ from nlos_lit.criticism.criticise import CriticismSettings, Findings, Trial, Tur
 from nlos_lit.criticism.diagnosis import _screened, alternatives, judge, weighed
 from nlos_lit.criticism.discrepancy import Discrepancy
 from nlos_lit.criticism.estimate import Uncertainty
+from nlos_lit.criticism.form import Form
 from nlos_lit.criticism.refit import Comparison
 from nlos_lit.criticism.screen import Candidate
 from nlos_lit.criticism.sensitivity import build_problem, weighted_columns
@@ -194,6 +195,16 @@ def test_what_is_left_is_flagged_or_not():
     assert said.unexplained.significant
     assert (said.unexplained.axis, said.unexplained.statistic) == ("wall", 400)
     assert not said.dominates, "nothing was named"
+
+
+@pytest.mark.parametrize(("axis", "gain", "said"), [("time", 200, "wall"), ("time", 20, "time"), ("rate", 200, "rate")])
+def test_what_was_taken_back_is_unexplained_where_most_was_left(axis, gain, said):
+    """Beside 200 nats along the wall, or nothing; a map that follows the count rate says so itself."""
+    found = findings([], [discrepancy("wall", gain)])
+    taken_back = Turn([], [], [], None, [], form=Form("specular_lobe", 900.0, 1000.0, 1800.0, 0.0, axis))
+    left = judge(Findings(found.base, found.final, [*found.turns, taken_back]), SPLIT, CriticismSettings()).unexplained
+    assert left.significant
+    assert left.axis == said
 
 
 def test_names_fall_where_more_is_left_than_they_explain():
