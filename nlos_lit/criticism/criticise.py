@@ -210,11 +210,11 @@ def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
 def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: bool = False) -> float:
     """Nats over the tested spots that an effect must promise, or gain once the scene is ``rebuilt``; ``over``: the misfit there.
 
-    The less of an effect the base leaves over, the more easily the base's own approximations look like it: below ``WELL`` retained
-    information the rebuilt scene must gain more, by the root of what is missing.
+    A base that has not quite converged is off along what it could imitate, and what is left of an effect takes that for its own:
+    nats in inverse proportion to the retained information. Below ``WELL`` the rebuilt scene must gain as much more.
     """
     least = s.least_gain if candidate.effect.moves_light else s.least_shape
-    scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) ** 0.5 if rebuilt else 1.0
+    scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) if rebuilt else 1.0
     return max(least * scarce, s.least_share * over)
 
 

@@ -155,8 +155,8 @@ def test_what_is_significant_must_gain_enough():
     counted = [candidate("irf_tail", gain=16), candidate("pile_up", gain=14), candidate("higher_order_bounces", gain=16)]
     assert [c.effect.name for c in significant(counted, settings, 0.0)] == ["irf_tail", "higher_order_bounces"]
     assert needed(few[2], settings, 0.0) == 25
-    assert needed(few[2], settings, 0.0, rebuilt=True) == pytest.approx(25 * 2)  # a quarter of WELL retained: twice as much
-    assert needed(few[2], settings, 4000.0, rebuilt=True) == pytest.approx(80)
+    assert needed(few[2], settings, 0.0, rebuilt=True) == pytest.approx(25 * 4)  # a quarter of WELL retained
+    assert needed(few[2], settings, 6000.0, rebuilt=True) == pytest.approx(120)
     assert needed(few[0], settings, 1350.0) == pytest.approx(27)  # 2 % of the misfit
     assert significant(few + counted, settings, 2050.0) == []
 
