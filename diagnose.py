@@ -14,19 +14,25 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from data_modules.scenes import load_scene
-from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, stay_in_run, write_config
-from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings
-from nlos_lit.criticism.plots import diagnosis_figures
-from nlos_lit.criticism.report import log_figures, write_report
-from nlos_lit.criticism.run import diagnose
-from nlos_lit.criticism.verdict import verdict
-from nlos_lit.errors import UserError
-from nlos_lit.memory import parse_bytes
-from nlos_lit.progress import StepTicker
-from nlos_lit.runs import open_run, pipeline_settings
-from nlos_lit.surfel_fit import RefineSettings
+from data_modules.load import load_scene
+from nlos_lit.capture.errors import UserError
+from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.report.diagnosis_figures import diagnosis_figures
+from nlos_lit.report.page import log_figures, write_report
+from nlos_lit.report.verdict import verdict
+from nlos_lit.runtime.command_line import (
+    quote_numbers,
+    refuse_finished_folder,
+    sentence_errors,
+    stay_in_run,
+    write_config,
+)
+from nlos_lit.runtime.memory import parse_bytes
+from nlos_lit.runtime.progress import StepTicker
+from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.training.run_folder import open_run, pipeline_settings
 
 log = logging.getLogger(__name__)
 
@@ -42,10 +48,16 @@ def main(config: DictConfig) -> None:
     if config.run is not None:
         folder = Path(config.run)
         if (folder / "diagnosis" / "diagnosis.json").exists():
-            raise UserError(f"{folder} already holds a diagnosis; move {folder / 'diagnosis'} away to diagnose it anew")
+            raise UserError(
+                f"{folder} already holds a diagnosis; move {folder / 'diagnosis'} away to diagnose it anew"
+            )
         run = open_run(folder)
-    settings = OmegaConf.to_container(config, resolve=True) if run is not None else write_config(config, folder)
-    scene, model = (settings["scene"], settings["model"]) if run is None else (run.config["scene"], run.config["model"])
+    settings = (
+        OmegaConf.to_container(config, resolve=True) if run is not None else write_config(config, folder)
+    )
+    scene, model = (
+        (settings["scene"], settings["model"]) if run is None else (run.config["scene"], run.config["model"])
+    )
     capture = run.capture if run is not None else load_scene(scene, settings["data_dir"], settings["seed"])[0]
     options = CriticismSettings(**settings["criticism"])
     pipeline = BasePipeline(
@@ -58,7 +70,11 @@ def main(config: DictConfig) -> None:
     if run is not None:
         with torch.no_grad():
             image = run.module.pipeline.phasor().cpu(), run.module.pipeline.phasor.grid
-    kept = {"scene": scene, "model": model, **{key: settings[key] for key in ("surfels", "criticism", "seed")}}
+    kept = {
+        "scene": scene,
+        "model": model,
+        **{key: settings[key] for key in ("surfels", "criticism", "seed")},
+    }
     try:
         with StepTicker("diagnosis") as ticker:
             diagnosis, _ = diagnose(

@@ -12,7 +12,7 @@ import numpy as np
 from data_modules.readers import READERS, ReaderOptions, detect_format, read_capture
 from data_modules.readers.assemble import direct_pulse, smooth
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,8 @@ def report(capture: Capture, fmt: str, findings: Findings) -> str:
         )
         heights, edges = np.histogram(findings.first_returns, bins=8)
         lines += [
-            f"             {a:6.3f} m {'#' * round(40 * n / heights.max())} {n}" for n, a in zip(heights, edges[:-1], strict=True)
+            f"             {a:6.3f} m {'#' * round(40 * n / heights.max())} {n}"
+            for n, a in zip(heights, edges[:-1], strict=True)
         ]
     else:
         lines.append("first return none found in the gate")
@@ -106,7 +107,13 @@ def draw(capture: Capture, findings: Findings, path: Path) -> None:
     samples.set(title="three spots, gated", xlabel="path (m)", ylabel="counts a bin")
     samples.legend()
     peak = first + int(np.argmax(findings.mean[first:last]))
-    _on_wall(figure, slice_, capture, capture.counts[:, peak].astype(np.float64), f"bin {peak}, path {way[peak]:.3f} m")
+    _on_wall(
+        figure,
+        slice_,
+        capture,
+        capture.counts[:, peak].astype(np.float64),
+        f"bin {peak}, path {way[peak]:.3f} m",
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -114,14 +121,24 @@ def draw(capture: Capture, findings: Findings, path: Path) -> None:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Print and plot what a capture file holds.")
     parser.add_argument("file", type=Path, help="capture file, or folder of C_i, C_d, sub_Sig")
-    parser.add_argument("--format", default="auto", help=f"auto, or one of {', '.join(reader.NAME for reader in READERS)}")
+    parser.add_argument(
+        "--format", default="auto", help=f"auto, or one of {', '.join(reader.NAME for reader in READERS)}"
+    )
     parser.add_argument("--bin-width-ps", type=float)
-    parser.add_argument("--wall-size", type=float, nargs="+", metavar="M", help="side of the scanned square, or its two sides, m")
+    parser.add_argument(
+        "--wall-size",
+        type=float,
+        nargs="+",
+        metavar="M",
+        help="side of the scanned square, or its two sides, m",
+    )
     parser.add_argument("--t-start", type=float, metavar="M", help="path at the start of bin 0, m")
     parser.add_argument("--gate", type=int, nargs=2, metavar=("FIRST", "LAST"), help="bins to fit")
     for name in ("flip-x", "flip-y", "swap-xy"):
         parser.add_argument(f"--{name}", action="store_true", default=None)
-    parser.add_argument("--raw-scale", action=argparse.BooleanOptionalAction, help="the file carries tal's raw scale, or not")
+    parser.add_argument(
+        "--raw-scale", action=argparse.BooleanOptionalAction, help="the file carries tal's raw scale, or not"
+    )
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
     given = vars(parser.parse_args(arguments))
     path, fmt, out = given.pop("file"), given.pop("format"), given.pop("out")
@@ -185,9 +202,13 @@ def _warnings(capture: Capture, mean: np.ndarray, totals: np.ndarray, returns: n
         told.append(f"the gate begins at bin {first} before the direct pulse has decayed; begin it later")
     depth = float(np.median(returns)) if len(returns) else 0.0
     if depth > 10:
-        told.append(f"the bin width implies a scene {depth:.0f} m away; check bin_width_ps (now {capture.bin_width_ps:g} ps)")
+        told.append(
+            f"the bin width implies a scene {depth:.0f} m away; check bin_width_ps (now {capture.bin_width_ps:g} ps)"
+        )
     elif len(returns) and depth < 0.02:
-        told.append(f"the first returns come from {100 * depth:.1f} cm; check the bin width, t_start and the gate")
+        told.append(
+            f"the first returns come from {100 * depth:.1f} cm; check the bin width, t_start and the gate"
+        )
     if extent > 10 or extent < 0.02:
         told.append(f"the wall is {extent:.3g} m across; check wall_size")
     if capture.bin_width_ps > 500 or capture.bin_width_ps < 0.5:
@@ -196,9 +217,15 @@ def _warnings(capture: Capture, mean: np.ndarray, totals: np.ndarray, returns: n
     if empty:
         told.append(f"{empty} of {capture.n_spots} spots hold no counts in the gate")
     if len(totals) > 8 and np.median(totals) > 0 and totals.max() > 50 * np.median(totals):
-        told.append(f"the strongest spot has {totals.max() / np.median(totals):.0f} times the median counts: a hot spot?")
+        told.append(
+            f"the strongest spot has {totals.max() / np.median(totals):.0f} times the median counts: a hot spot?"
+        )
     filled = np.flatnonzero(mean[first:last])
-    if capture.is_counts and len(filled) and (filled[0] > 0.05 * (last - first) or filled[-1] < 0.95 * (last - first) - 1):
+    if (
+        capture.is_counts
+        and len(filled)
+        and (filled[0] > 0.05 * (last - first) or filled[-1] < 0.95 * (last - first) - 1)
+    ):
         told.append(
             f"only bins {first + filled[0]} to {first + filled[-1]} of the gate hold counts; the rest may be cropped, not dark"
         )
@@ -206,7 +233,9 @@ def _warnings(capture: Capture, mean: np.ndarray, totals: np.ndarray, returns: n
         begins = np.argmax(capture.counts[:, first:last] > 0, axis=1)[totals > 0]
         busy = np.median(totals) > 20 * (last - first)
         if busy and len(begins) and np.ptp(begins) > 0.2 * (last - first):
-            told.append("some spots hold nothing in the first part of the gate where others do: cropped there, not dark")
+            told.append(
+                "some spots hold nothing in the first part of the gate where others do: cropped there, not dark"
+            )
     return told
 
 
@@ -225,12 +254,21 @@ def _three(values: np.ndarray) -> str:
 
 def _on_wall(figure, axes, capture: Capture, values: np.ndarray, title: str) -> None:
     """Values over the wall points, +x to the left and +y up, as one sees the wall's picture of the scene from the wall."""
-    points = capture.laser if np.ptp(capture.laser, axis=0).max() > np.ptp(capture.sensor, axis=0).max() else capture.sensor
+    points = (
+        capture.laser
+        if np.ptp(capture.laser, axis=0).max() > np.ptp(capture.sensor, axis=0).max()
+        else capture.sensor
+    )
     if capture.scan_shape is not None and len(capture.scan_shape) == 2:
         (x0, y0), (x1, y1) = points[0, :2], points[-1, :2]
-        half = [(b - a) / max(n - 1, 1) / 2 for a, b, n in ((x0, x1, capture.scan_shape[0]), (y0, y1, capture.scan_shape[1]))]
+        half = [
+            (b - a) / max(n - 1, 1) / 2
+            for a, b, n in ((x0, x1, capture.scan_shape[0]), (y0, y1, capture.scan_shape[1]))
+        ]
         extent = (x0 - half[0], x1 + half[0], y0 - half[1], y1 + half[1])
-        image = axes.imshow(values.reshape(capture.scan_shape).T, origin="lower", extent=extent, cmap="viridis")
+        image = axes.imshow(
+            values.reshape(capture.scan_shape).T, origin="lower", extent=extent, cmap="viridis"
+        )
         axes.invert_xaxis()
     else:
         places, index = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)

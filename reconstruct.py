@@ -11,16 +11,18 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from data_modules.scenes import load_scene
-from nlos_lit import figures
+from data_modules.load import load_scene
 from nlos_lit.baselines import estimate_bytes, reconstruct_directed
 from nlos_lit.baselines.surface import front_points
-from nlos_lit.command import quote_numbers, refuse_finished_folder, sentence_errors, write_config
-from nlos_lit.export import write_json, write_points, write_volume
-from nlos_lit.geometry_metrics import geometry_errors
-from nlos_lit.memory import check_machine, parse_bytes, peak_bytes
-from nlos_lit.scan import volume_grid
-from nlos_lit.summary import git_state, versions
+from nlos_lit.capture.volume_grid import volume_grid
+from nlos_lit.io.files import write_json
+from nlos_lit.io.points import write_points
+from nlos_lit.io.volumes import write_volume
+from nlos_lit.metrics.geometry import geometry_errors
+from nlos_lit.report import figures
+from nlos_lit.runtime.command_line import quote_numbers, refuse_finished_folder, sentence_errors, write_config
+from nlos_lit.runtime.memory import check_machine, parse_bytes, peak_bytes
+from nlos_lit.training.summary import git_state, versions
 
 log = logging.getLogger(__name__)
 
@@ -36,14 +38,24 @@ def main(config: DictConfig) -> None:
     grid = volume_grid(capture, **scene["volume"])
     needed = estimate_bytes(capture, grid, method["name"])
     check_machine(needed, f"method={method['name']}")
-    log.info("%s: volume %d x %d x %d voxels, about %.2f GiB", method["name"], *grid.shape[1:], grid.shape[0], needed / 2**30)
+    log.info(
+        "%s: volume %d x %d x %d voxels, about %.2f GiB",
+        method["name"],
+        *grid.shape[1:],
+        grid.shape[0],
+        needed / 2**30,
+    )
     setup = time.perf_counter() - began
     budget = parse_bytes(settings["memory_budget"])
-    volume, field = reconstruct_directed(capture, grid, method["name"], budget_bytes=budget, **method["options"])
+    volume, field = reconstruct_directed(
+        capture, grid, method["name"], budget_bytes=budget, **method["options"]
+    )
     seconds = time.perf_counter() - began - setup
     values = (volume / volume.max().clamp_min(1e-30)).numpy()
     write_volume(folder / "volume.h5", values, grid)
-    shown = figures.volume_projections(values, grid, threshold=scene["threshold"], title=f"{scene['name']}, {method['name']}")
+    shown = figures.volume_projections(
+        values, grid, threshold=scene["threshold"], title=f"{scene['name']}, {method['name']}"
+    )
     figures.save_figure(shown, folder / "figures" / "volume.png")
     points = front_points(values, grid, scene["threshold"], None if field is None else field.numpy())
     write_points(folder / "points.ply", points)

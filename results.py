@@ -16,15 +16,20 @@ import sys
 import time
 from pathlib import Path
 
-from nlos_lit.command import sentence_errors
-from nlos_lit.errors import UserError
-from nlos_lit.evidence.experiments import EXPERIMENTS
-from nlos_lit.evidence.page import update_page
-from nlos_lit.evidence.subjects import SIZES
-from nlos_lit.evidence.workspace import ROOT, Workspace
+from nlos_lit.capture.errors import UserError
+from nlos_lit.paper.experiments import EXPERIMENTS
+from nlos_lit.paper.page import update_page
+from nlos_lit.paper.subjects import SIZES
+from nlos_lit.paper.workspace import ROOT, Workspace
+from nlos_lit.runtime.command_line import sentence_errors
 
 log = logging.getLogger(__name__)
-DEFAULTS = {"size": "full", "data": str(ROOT / "data"), "out": None, "docs": str(ROOT / "docs" / "results.md")}
+DEFAULTS = {
+    "size": "full",
+    "data": str(ROOT / "data"),
+    "out": None,
+    "docs": str(ROOT / "docs" / "results.md"),
+}
 
 
 def parse(arguments: list[str]) -> tuple[list[str], dict[str, str | None]]:

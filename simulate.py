@@ -15,11 +15,20 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from data_modules.readers import write_capture
-from data_modules.simulate import SCENES, Mesh, ScanPlan, SensorModel, bunny_two_albedo, load_mesh, save_truth, simulate_capture
-from nlos_lit.command import sentence_errors
+from data_modules.simulate import (
+    SCENES,
+    Mesh,
+    ScanPlan,
+    SensorModel,
+    bunny_two_albedo,
+    load_mesh,
+    save_truth,
+    simulate_capture,
+)
+from nlos_lit.capture.errors import UserError
 from nlos_lit.effects import EFFECTS
-from nlos_lit.effects.measure import measure
-from nlos_lit.errors import UserError
+from nlos_lit.runtime.command_line import sentence_errors
+from nlos_lit.surfels.measure import measure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +55,9 @@ class Options:
 
 
 SECTIONS = (Options, ScanPlan, SensorModel)
-EFFECT_HELP = f"effects are {', '.join(effect.name for effect in EFFECTS)}, their strengths EFFECT.PARAMETER=VALUE"
+EFFECT_HELP = (
+    f"effects are {', '.join(effect.name for effect in EFFECTS)}, their strengths EFFECT.PARAMETER=VALUE"
+)
 SCENE_HELP = f"scene is one of {', '.join(SCENES)}, mesh (with mesh=FILE) or two_albedo (with mesh=FILE)"
 
 
@@ -78,12 +89,16 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
             )
     try:
         merged = (
-            OmegaConf.merge(section, OmegaConf.from_dotlist([f"{key}={given[key]}" for key in given if key in own]))
+            OmegaConf.merge(
+                section, OmegaConf.from_dotlist([f"{key}={given[key]}" for key in given if key in own])
+            )
             for section, own in zip(map(OmegaConf.structured, SECTIONS), names, strict=True)
         )
         options, scan, sensor = map(OmegaConf.to_object, merged)
     except OmegaConfBaseException as error:
-        raise UserError(f"cannot use {error.full_key}={given.get(error.full_key)}: {str(error).splitlines()[0]}") from error
+        raise UserError(
+            f"cannot use {error.full_key}={given.get(error.full_key)}: {str(error).splitlines()[0]}"
+        ) from error
     return options, scan, sensor
 
 
@@ -107,7 +122,9 @@ def main(arguments: list[str]) -> None:
     options, scan, sensor = parse(arguments)
     values = strengths(arguments)
     if values and not options.effects:
-        raise UserError(f"found {next(iter(values))}=… but no effects; name them: effects=[{next(iter(values)).partition('.')[0]}]")
+        raise UserError(
+            f"found {next(iter(values))}=… but no effects; name them: effects=[{next(iter(values)).partition('.')[0]}]"
+        )
     if options.out is None:
         raise UserError("say where to write: out=FILE.hdf5")
     out = Path(options.out)
@@ -119,7 +136,9 @@ def main(arguments: list[str]) -> None:
     sensor = exposed(sensor, options.exposure)
     how = {"two_sided": options.two_sided, "detail": options.detail, "progress": True}
     if options.effects:
-        capture, truth = measure(mesh, scan, sensor, options.seed, options.effects, values, exposure=options.exposure, **how)
+        capture, truth = measure(
+            mesh, scan, sensor, options.seed, options.effects, values, exposure=options.exposure, **how
+        )
     else:
         capture, truth = simulate_capture(mesh, scan, sensor, options.seed, **how)
     capture = dataclasses.replace(capture, provenance={**capture.provenance, "exposure": options.exposure})
@@ -128,7 +147,9 @@ def main(arguments: list[str]) -> None:
     save_truth(truth_file, truth)
     mean = capture.counts.sum(axis=1).mean()
     print(f"{out}: {capture.kind}, {capture.n_spots} spots × {capture.n_bins} bins, {mean:.0f} counts a spot")
-    print(f"{truth_file}: depth, normals and albedo on {truth.depth.shape[0]}×{truth.depth.shape[1]} points, and the mesh")
+    print(
+        f"{truth_file}: depth, normals and albedo on {truth.depth.shape[0]}×{truth.depth.shape[1]} points, and the mesh"
+    )
 
 
 if __name__ == "__main__":

@@ -15,10 +15,16 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from omegaconf import DictConfig
 
-from nlos_lit.callbacks import Bar, Figures, History, Scores
-from nlos_lit.command import quiet_libraries, quote_numbers, refuse_finished_folder, sentence_errors, write_config
-from nlos_lit.results import refine_run, shown_spots, write_results
-from nlos_lit.runs import field_shards, find_checkpoint, prepare_run
+from nlos_lit.runtime.command_line import (
+    quiet_libraries,
+    quote_numbers,
+    refuse_finished_folder,
+    sentence_errors,
+    write_config,
+)
+from nlos_lit.training.callbacks import Bar, Figures, History, Scores
+from nlos_lit.training.outcome import refine_run, shown_spots, write_results
+from nlos_lit.training.run_folder import field_shards, find_checkpoint, prepare_run
 
 log = logging.getLogger(__name__)
 
@@ -48,12 +54,18 @@ def main(config: DictConfig) -> None:
         use_distributed_sampler=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        logger=TensorBoardLogger(folder, name="", version="tensorboard") if settings["logger"]["tensorboard"] else False,
+        logger=TensorBoardLogger(folder, name="", version="tensorboard")
+        if settings["logger"]["tensorboard"]
+        else False,
         callbacks=[
             Scores(),
             history,
             Bar(),
-            Figures(monitor["figures_every"], shown_spots(run.capture.n_spots, monitor["spots"]), folder / "figures"),
+            Figures(
+                monitor["figures_every"],
+                shown_spots(run.capture.n_spots, monitor["spots"]),
+                folder / "figures",
+            ),
             ModelCheckpoint(
                 folder / "checkpoints",
                 filename="iteration",
@@ -64,10 +76,14 @@ def main(config: DictConfig) -> None:
         ],
     )
     try:
-        trainer.fit(run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None)
+        trainer.fit(
+            run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None
+        )
     except SystemExit:  # Lightning's answer to Ctrl-C
         name = settings["scene"]["name"]
-        log.info("interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder)
+        log.info(
+            "interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder
+        )
         sys.exit(130)
     run.module.pipeline.phasor.hold()  # with the processes that end here
     if not trainer.is_global_zero:
@@ -82,7 +98,10 @@ def main(config: DictConfig) -> None:
     if refined is not None:
         log.info("refined by %d surfels: held-out NMSE %.4f", refined["surfels"], refined["heldout"]["nmse"])
         for effect, reported in refined["effects"].items():
-            values = (f"{name} {q['value']:.4g} {q['unit'].removeprefix('1')}".rstrip() for name, q in reported.items())
+            values = (
+                f"{name} {q['value']:.4g} {q['unit'].removeprefix('1')}".rstrip()
+                for name, q in reported.items()
+            )
             log.info("%s: %s", effect, ", ".join(values))
 
 

@@ -53,7 +53,14 @@ def table() -> dict[str, object]:
             level = LEVELS[(k + k // len(LEVELS)) % len(LEVELS)]
             if any(scene in RENDERS for scene in scenes):
                 level = min(level, CALM)
-            spec = draw_spec(seed, kind, effects=names or None, scenes=scenes, strengths=strengths or tuple(steps), levels=(level,))
+            spec = draw_spec(
+                seed,
+                kind,
+                effects=names or None,
+                scenes=scenes,
+                strengths=strengths or tuple(steps),
+                levels=(level,),
+            )
             drawn.append(((k + 0.5) / len(wanted), f"{kind}_{k:02d}", spec))
     return {name: spec for _, name, spec in sorted(drawn, key=lambda entry: entry[0])}
 
@@ -62,7 +69,7 @@ def work(name: str, spec: object) -> str:
     """Diagnose one capture and store the outcome."""
     from blind_judge import one_thread, run_case
 
-    from nlos_lit.criticism.criticise import CriticismSettings
+    from nlos_lit.inference.criticise import CriticismSettings
 
     one_thread()
     outcome = run_case(spec, CriticismSettings(numerics=False, processes=1))

@@ -41,7 +41,9 @@ def error(case: dict) -> float:
 def true_statistic(case: dict) -> str:
     if not case["hidden"]:
         return ""
-    return f"{case['statistic']:.0f}" + (f" ± {case['statistic_error']:.0f}" if "statistic_error" in case else "")
+    return f"{case['statistic']:.0f}" + (
+        f" ± {case['statistic_error']:.0f}" if "statistic_error" in case else ""
+    )
 
 
 def first_right(case: dict) -> bool:
@@ -86,19 +88,63 @@ def rows(cases: list[dict]) -> list[tuple[str, str, str]]:
     unnamed = [c for c in unknown if not c["named"]]
     share = f"; median share {np.median(shares):.0%}, of all nats {_total(seen):.0%}" if shares else ""
     return [
-        ("hidden effect named first, alone or in its group (true statistic > 50)", "≥ 95 %", interval(len(right), len(seen))),
-        ("… where it exceeds 50 by two of its standard errors", "", interval(sum(map(first_right, sure)), len(sure))),
+        (
+            "hidden effect named first, alone or in its group (true statistic > 50)",
+            "≥ 95 %",
+            interval(len(right), len(seen)),
+        ),
+        (
+            "… where it exceeds 50 by two of its standard errors",
+            "",
+            interval(sum(map(first_right, sure)), len(sure)),
+        ),
         ("… named first itself", "", interval(len(alone), len(seen))),
         ("the same below a true statistic of 50", "", interval(sum(map(first_right, weak)), len(weak))),
-        ("false alarms on effect-free captures", "≤ 5 %", interval(sum(bool(c["named"]) for c in by["null"]), len(by["null"]))),
-        ("… something unexplained there", "", interval(sum(bool(c["unexplained"]) for c in by["null"]), len(by["null"]))),
-        ("nothing else named beside one or two hidden effects", "", interval(sum(not overnamed(c) for c in held), len(held))),
-        ("parameters within 3 reported standard errors or 15 %", "≥ 90 %", interval(sum(checks), len(checks))),
-        ("at least 80 % of the oracle's held-out gain", "≥ 80 % of it", interval(sum(map(_nearly_all, seen)), len(seen)) + share),
-        ("… where the true statistic exceeds 50 by two of its errors", "", interval(sum(map(_nearly_all, sure)), len(sure))),
-        ("two effects at once: both named", "≥ 85 %", interval(sum(map(all_named, by["pair"])), len(by["pair"]))),
-        ("… without pairs whose missing effect adds no statistic of 50", "", interval(sum(map(all_named, shown)), len(shown))),
-        ("outside the registry: unexplained, right axis, nothing named", "≥ 90 %", interval(len(axis), len(unknown))),
+        (
+            "false alarms on effect-free captures",
+            "≤ 5 %",
+            interval(sum(bool(c["named"]) for c in by["null"]), len(by["null"])),
+        ),
+        (
+            "… something unexplained there",
+            "",
+            interval(sum(bool(c["unexplained"]) for c in by["null"]), len(by["null"])),
+        ),
+        (
+            "nothing else named beside one or two hidden effects",
+            "",
+            interval(sum(not overnamed(c) for c in held), len(held)),
+        ),
+        (
+            "parameters within 3 reported standard errors or 15 %",
+            "≥ 90 %",
+            interval(sum(checks), len(checks)),
+        ),
+        (
+            "at least 80 % of the oracle's held-out gain",
+            "≥ 80 % of it",
+            interval(sum(map(_nearly_all, seen)), len(seen)) + share,
+        ),
+        (
+            "… where the true statistic exceeds 50 by two of its errors",
+            "",
+            interval(sum(map(_nearly_all, sure)), len(sure)),
+        ),
+        (
+            "two effects at once: both named",
+            "≥ 85 %",
+            interval(sum(map(all_named, by["pair"])), len(by["pair"])),
+        ),
+        (
+            "… without pairs whose missing effect adds no statistic of 50",
+            "",
+            interval(sum(map(all_named, shown)), len(shown)),
+        ),
+        (
+            "outside the registry: unexplained, right axis, nothing named",
+            "≥ 90 %",
+            interval(len(axis), len(unknown)),
+        ),
         ("… nothing named", "", interval(len(unnamed), len(unknown))),
     ]
 
@@ -126,9 +172,14 @@ def confusion(cases: list[dict]) -> list[tuple[str, dict[str, int]]]:
 
 
 def line(case: dict, mark: str) -> str:
-    hidden = ", ".join(f"{n} ({STRENGTHS[s]})" for n, s in zip(case["spec"]["effects"], case["spec"]["strengths"], strict=True))
+    hidden = ", ".join(
+        f"{n} ({STRENGTHS[s]})"
+        for n, s in zip(case["spec"]["effects"], case["spec"]["strengths"], strict=True)
+    )
     said = ", ".join("/".join(group(case, n)) for n in case["named"]) or "–"
-    wrong = "; ".join(f"{q} {s:+.1f} σ, {r:+.0%}" for found in case["errors"].values() for q, (s, r) in found.items())
+    wrong = "; ".join(
+        f"{q} {s:+.1f} σ, {r:+.0%}" for found in case["errors"].values() for q, (s, r) in found.items()
+    )
     cells = (
         case["spec"]["scene"] + mark, f"{case['spec']['level']:g}", hidden or "nothing", true_statistic(case),
         said, case["unexplained"] or "–", f"{case['gain']:.0f}/{case['oracle']:.0f}" if hidden else "", wrong,

@@ -25,7 +25,7 @@ from torch.nn.parallel import DistributedDataParallel
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
 
 from nlos_lit.functional.sharded import leave_buffers
-from nlos_lit.objective import communicated_bytes
+from nlos_lit.model.objective import communicated_bytes
 
 RANKS = 2
 

@@ -21,7 +21,7 @@ from report import store, stored, table
 from timing import copy_bandwidth, machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
 
-from nlos_lit.memory import peak_bytes
+from nlos_lit.runtime.memory import peak_bytes
 
 GIB = 2**30
 BETWEEN = 10  # iterations between looks at the capacity, as in training with logging
@@ -110,7 +110,16 @@ def main(arguments: list[str]) -> None:
             kind = f"gpu/{device.type}-{'tiny' if small else 'full'}"
             store(kind, workload.name, measure(tiny(workload) if small else workload, device))
             rows.append(stored(kind, workload.name))
-    head = ["scene", "set-up", "iteration", "total", "paper, A100", "product / copy bandwidth", "memory", "waits an iteration"]
+    head = [
+        "scene",
+        "set-up",
+        "iteration",
+        "total",
+        "paper, A100",
+        "product / copy bandwidth",
+        "memory",
+        "waits an iteration",
+    ]
     print(
         table(
             head,

@@ -42,7 +42,9 @@ def measure(workload: Workload, repeats: int = 9) -> dict[str, object]:
 
 
 def run() -> None:
-    measure(replace(BASE, spots=(16, 16), pitch=1 / 16, lateral=None, planes=8), 2)  # libraries load and warm up
+    measure(
+        replace(BASE, spots=(16, 16), pitch=1 / 16, lateral=None, planes=8), 2
+    )  # libraries load and warm up
     for axis, cases in AXES.items():
         for value, workload in cases:
             name = f"{axis}={value}"

@@ -19,8 +19,8 @@ from torch.utils.checkpoint import checkpoint
 from workload import Training
 
 from nlos_lit.functional.concentric import wall_frame
+from nlos_lit.functional.losses import transient_loss
 from nlos_lit.functional.phasor import virtual_illumination
-from nlos_lit.losses import transient_loss
 
 
 class _Propagation(torch.autograd.Function):
@@ -31,7 +31,9 @@ class _Propagation(torch.autograd.Function):
         ctx.literal = literal
         ctx.save_for_backward(weights)
         nx, ny = literal.grid.shape[1:]
-        mixed = torch.stack([torch.einsum("f,fxy->xy", weights.to(p.dtype), p) for p in map(literal.products, literal.depth)])
+        mixed = torch.stack(
+            [torch.einsum("f,fxy->xy", weights.to(p.dtype), p) for p in map(literal.products, literal.depth)]
+        )
         return torch.fft.ifft2(mixed)[:, :nx, :ny].contiguous()
 
     @staticmethod
@@ -55,7 +57,11 @@ class LiteralIteration:
     """
 
     def __init__(
-        self, training: Training, precision: torch.dtype = torch.float32, reach: float = 5.5, samples_at_once: int = 1 << 22
+        self,
+        training: Training,
+        precision: torch.dtype = torch.float32,
+        reach: float = 5.5,
+        samples_at_once: int = 1 << 22,
     ) -> None:
         self.training, self.precision, self.samples_at_once = training, precision, samples_at_once
         pipeline, capture = training.pipeline, training.capture
@@ -77,7 +83,9 @@ class LiteralIteration:
         self.field /= self.field.abs().mean()
         mx, my = self.grid.shape[1:]
         if (mx, my) != (nx, ny):
-            raise ValueError(f"the literal iteration has a voxel column a spot; found {mx} x {my} for {nx} x {ny} spots")
+            raise ValueError(
+                f"the literal iteration has a voxel column a spot; found {mx} x {my} for {nx} x {ny} spots"
+            )
         self.padded = (2 * nx, 2 * ny)
         self.depth = self.grid.z.tolist()
         steps = [torch.minimum(torch.arange(2 * n), 2 * n - torch.arange(2 * n)).double() for n in (nx, ny)]
@@ -125,7 +133,9 @@ class LiteralIteration:
         last = torch.tensor([nx - 1, ny - 1, nz - 1])
         steps = (points - geometry.origin) / geometry.pitch
         unit = (2 * steps / last - 1)[..., [1, 0, 2]]
-        value = grid_sample(volume[None, None], unit.view(1, 1, 1, -1, 3), align_corners=True).view(points.shape[:-1])
+        value = grid_sample(volume[None, None], unit.view(1, 1, 1, -1, 3), align_corners=True).view(
+            points.shape[:-1]
+        )
         return torch.where(((steps >= 0) & (steps <= last)).all(-1), value, 0.0)
 
     def depths(self, intensity: Tensor, origins: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
@@ -164,7 +174,9 @@ class LiteralIteration:
         to_wall, there = point - wall[spot], up[spot]
         leg = to_wall.norm(dim=1)
         unit = to_wall / leg[:, None]
-        cosines = (unit * there).sum(1).abs() * (unit * normal).sum(1).abs() * (direction * there).sum(1).abs()
+        cosines = (
+            (unit * there).sum(1).abs() * (unit * normal).sum(1).abs() * (direction * there).sum(1).abs()
+        )
         contribution = self.at(albedo, point) * cosines / leg**2 * renderer.solid_angle
         arrival = (leg + distance[valid] - capture.t_start) / capture.bin_length
         rows = max(1, self.samples_at_once // renderer.n_bins)
@@ -178,7 +190,9 @@ class LiteralIteration:
         renderer = self.pipeline.renderer
         bins = torch.arange(renderer.n_bins, dtype=self.precision) + 0.5
         gauss = torch.exp(-0.5 * ((bins - arrival[:, None]) / renderer.splat_sigma) ** 2)
-        return torch.zeros(count, renderer.n_bins, dtype=self.precision).index_add(0, spot, contribution[:, None] * gauss)
+        return torch.zeros(count, renderer.n_bins, dtype=self.precision).index_add(
+            0, spot, contribution[:, None] * gauss
+        )
 
 
 def _neighbour(point: Tensor, hit: Tensor, di: int, dj: int) -> tuple[Tensor, Tensor]:

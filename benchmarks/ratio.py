@@ -40,16 +40,24 @@ GROWTH = {
 }
 
 
-def evaluate(iteration: Training | LiteralIteration, spots: torch.Tensor, counts: torch.Tensor) -> dict[str, torch.Tensor]:
+def evaluate(
+    iteration: Training | LiteralIteration, spots: torch.Tensor, counts: torch.Tensor
+) -> dict[str, torch.Tensor]:
     """Data term, loss, and the data term's gradients: the paper's λ1 = 100 would hide them under the sparsity's."""
-    phasor, sensor, albedo = iteration.pipeline.phasor, iteration.pipeline.laser_sensor, iteration.pipeline.albedo
+    phasor, sensor, albedo = (
+        iteration.pipeline.phasor,
+        iteration.pipeline.laser_sensor,
+        iteration.pipeline.albedo,
+    )
     named = {
         "omega_pf": phasor.omega_pf.raw, "sigma_pf": phasor.sigma_pf.raw, "sigma_ls": sensor.sigma_ls.raw,
         "kappa_s": sensor.kappa_s.raw, "I_l": sensor.intensity.raw, "eta_s": sensor.background.raw, "albedo": albedo.raw,
     }  # fmt: skip
     terms = iteration.terms(spots, counts.to(albedo.raw.dtype))
     gradients = torch.autograd.grad(terms["transient"], list(named.values()))
-    return {"E_H": terms["transient"].detach(), "loss": terms["loss"].detach()} | dict(zip(named, gradients, strict=True))
+    return {"E_H": terms["transient"].detach(), "loss": terms["loss"].detach()} | dict(
+        zip(named, gradients, strict=True)
+    )
 
 
 def relative(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) -> dict[str, float]:
@@ -113,8 +121,14 @@ def growth() -> None:
         for value, workload in cases:
             name = f"{axis}={value}"
             if stored("ratio_growth", name) is None:
-                store("ratio_growth", name, {"axis": axis, "value": value} | compare(replace(workload, name=name), 2))
-            print(name, {k: v for k, v in stored("ratio_growth", name).items() if k.endswith("_s")}, flush=True)
+                store(
+                    "ratio_growth",
+                    name,
+                    {"axis": axis, "value": value} | compare(replace(workload, name=name), 2),
+                )
+            print(
+                name, {k: v for k, v in stored("ratio_growth", name).items() if k.endswith("_s")}, flush=True
+            )
 
 
 def report() -> None:

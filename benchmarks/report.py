@@ -64,7 +64,9 @@ def write_section(name: str, text: str) -> None:
     PAGE.write_text(head + begin + "\n\n" + text + "\n\n" + end + rest.split(end, 1)[1])
 
 
-def growth_figure(name: str, series: dict[str, tuple[Sequence[float], dict[str, Sequence[float]]]], label: str) -> None:
+def growth_figure(
+    name: str, series: dict[str, tuple[Sequence[float], dict[str, Sequence[float]]]], label: str
+) -> None:
     """One log-log panel a quantity: ``{quantity: (values, {curve: times})}`` into docs/images/NAME.png."""
     import matplotlib
 
@@ -73,7 +75,9 @@ def growth_figure(name: str, series: dict[str, tuple[Sequence[float], dict[str, 
 
     columns = min(3, len(series))
     rows = -(-len(series) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(3.4 * columns, 2.9 * rows), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(3.4 * columns, 2.9 * rows), squeeze=False, layout="constrained"
+    )
     for panel, (quantity, (x, curves)) in zip(axes.flat, series.items(), strict=False):
         for curve, y in curves.items():
             panel.loglog(x, y, "o-", label=f"{curve}, slope {slope(x, y):.2f}")

@@ -24,7 +24,8 @@ from report import ROOT, store, stored, table, write_section
 from timing import machine, median
 from workload import TABLE_2, Training, Workload, synthetic_capture, tiny
 
-from nlos_lit.memory import peak_bytes, resident_bytes, run_bytes
+from nlos_lit.runtime.memory import peak_bytes, resident_bytes
+from nlos_lit.training.run_folder import run_bytes
 
 SAME = {"Erato": "Dragon", "Indonesian": "Dragon", "NLOS": "44i"}
 LEAST = 12  # iterations measured where the total is projected
@@ -71,7 +72,14 @@ def measure(workload: Workload, allowed_s: float, device: str = "cpu") -> dict[s
 def run(names: list[str], threads: int, allowed_s: float) -> None:
     for name in names:
         if stored("table2", name) is None:
-            command = [sys.executable, __file__, "one", f"names={name}", f"threads={threads}", f"seconds={allowed_s}"]
+            command = [
+                sys.executable,
+                __file__,
+                "one",
+                f"names={name}",
+                f"threads={threads}",
+                f"seconds={allowed_s}",
+            ]
             subprocess.run(command, check=True)
         print(json.dumps(stored("table2", name)), flush=True)
 
@@ -116,7 +124,7 @@ def draw(minutes: dict[str, tuple[float, float, float]]) -> None:
     """Bars of minutes by scene (paper; ours in the process's own time; ours on the wall's clock) into docs/images/table2.png."""
     from matplotlib.figure import Figure
 
-    from nlos_lit.figures import save_figure
+    from nlos_lit.report.style import save_figure
 
     labels = ("paper, A100", "ours, one core's own time", "ours, on the wall's clock")
     figure = Figure(figsize=(7, 4.2), layout="constrained")

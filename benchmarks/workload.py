@@ -19,12 +19,12 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from nlos_lit.build import PipelineSettings, build_pipeline, match_energy, normalisation  # noqa: E402
-from nlos_lit.capture import Capture  # noqa: E402
-from nlos_lit.objective import Objective, adam  # noqa: E402
-from nlos_lit.phasor import PhasorPlan  # noqa: E402
-from nlos_lit.pipeline import Pipeline  # noqa: E402
-from nlos_lit.scan import volume_grid  # noqa: E402
+from nlos_lit.capture import Capture
+from nlos_lit.capture.volume_grid import volume_grid
+from nlos_lit.model.build import PipelineSettings, build_pipeline, match_energy, normalisation
+from nlos_lit.model.objective import Objective, adam
+from nlos_lit.model.phasor import PhasorPlan
+from nlos_lit.model.pipeline import Pipeline
 
 RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}  # conf/model/default.yaml
 LAMBDA_ALBEDO = 5e-3
@@ -82,7 +82,17 @@ class Workload:
 
 def _chen(name: str, depth: float, planes: int, iterations: int, hours: float) -> Workload:
     return Workload(
-        name, (256, 256), 1024, 2 / 256, 0.01, depth, planes, 0.005, threshold=0.05, iterations=iterations, paper_hours=hours
+        name,
+        (256, 256),
+        1024,
+        2 / 256,
+        0.01,
+        depth,
+        planes,
+        0.005,
+        threshold=0.05,
+        iterations=iterations,
+        paper_hours=hours,
     )
 
 
@@ -101,8 +111,12 @@ TABLE_2 = (
     _chen("Indonesian", 0.7, 128, 150, 1.93),
     Workload("34", (64, 64), 500, 1 / 64, 0.008, 0.2, 105, 0.004, iterations=300, paper_hours=1.05),
     Workload("Bike", (256, 256), 512, 2 / 256, 0.0096, 0.7, 64, 0.0126, iterations=170, paper_hours=1.73),
-    Workload("Resolution", (256, 256), 512, 2 / 256, 0.0096, 0.9, 26, 0.012, iterations=300, paper_hours=1.33),
-    Workload("SU", (64, 64), 2048, 0.7 / 64, 0.0012, 0.5, 584, 0.0012, gate=800, iterations=200, paper_hours=6.10),
+    Workload(
+        "Resolution", (256, 256), 512, 2 / 256, 0.0096, 0.9, 26, 0.012, iterations=300, paper_hours=1.33
+    ),
+    Workload(
+        "SU", (64, 64), 2048, 0.7 / 64, 0.0012, 0.5, 584, 0.0012, gate=800, iterations=200, paper_hours=6.10
+    ),
     _liu("44i", 150, 3.76),
     _liu("NLOS", 180, 4.38),
 )
@@ -135,10 +149,15 @@ def surface_points(workload: Workload, spacing: float) -> tuple[np.ndarray, np.n
     half = 0.5 * workload.pitch * min(workload.spots)
     near, span = workload.depth, workload.planes * workload.plane_pitch
     count = max(5, math.ceil(half / spacing))
-    u, v = (c.ravel() for c in np.meshgrid(np.linspace(-0.5, 0.5, count), np.linspace(-0.5, 0.5, count), indexing="ij"))
+    u, v = (
+        c.ravel()
+        for c in np.meshgrid(np.linspace(-0.5, 0.5, count), np.linspace(-0.5, 0.5, count), indexing="ij")
+    )
     plate = np.stack([half * (u + 0.3), half * (v - 0.2), near + span * (0.7 + 0.25 * u)], axis=1)
     on = u**2 + v**2 < 0.2
-    dome = np.stack([half * (0.8 * u - 0.35), half * (0.8 * v + 0.3), near + span * (0.2 + 1.0 * (u**2 + v**2))], axis=1)[on]
+    dome = np.stack(
+        [half * (0.8 * u - 0.35), half * (0.8 * v + 0.3), near + span * (0.2 + 1.0 * (u**2 + v**2))], axis=1
+    )[on]
     return np.concatenate([plate, dome]), np.concatenate([np.full(len(plate), 0.9), np.full(len(dome), 0.4)])
 
 
@@ -149,7 +168,9 @@ def synthetic_capture(workload: Workload, counts_per_spot: float = 3000.0, seed:
     wall = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((nx, ny))], axis=-1).reshape(-1, 3)
     sensor = wall if workload.confocal else np.zeros_like(wall)
     points, albedo = (torch.from_numpy(a).float() for a in surface_points(workload, 1.3 * workload.pitch))
-    to_points = lambda a: torch.cdist(torch.from_numpy(a).float(), points, compute_mode="donot_use_mm_for_euclid_dist")  # noqa: E731
+    to_points = lambda a: torch.cdist(
+        torch.from_numpy(a).float(), points, compute_mode="donot_use_mm_for_euclid_dist"
+    )  # noqa: E731
     generator = torch.Generator().manual_seed(seed)
     counts = np.empty((len(wall), workload.bins), dtype=np.uint16)
     for begin in range(0, len(wall), 512):
@@ -158,14 +179,23 @@ def synthetic_capture(workload: Workload, counts_per_spot: float = 3000.0, seed:
         bins = ((d_l + d_s) / workload.bin_length).long()
         inside = bins < workload.bins
         strength = torch.where(inside, albedo / (d_l * d_s) ** 2, 0.0)
-        expected = torch.zeros(len(d_l), workload.bins).scatter_add_(1, bins.clamp_max(workload.bins - 1), strength)
+        expected = torch.zeros(len(d_l), workload.bins).scatter_add_(
+            1, bins.clamp_max(workload.bins - 1), strength
+        )
         if begin == 0:
             gain = counts_per_spot / expected.sum(1).mean()
         expected = expected * gain + 0.1 * counts_per_spot / workload.bins
         counts[rows] = torch.poisson(expected, generator=generator).numpy().astype(np.uint16)
     up = np.tile([0.0, 0.0, 1.0], (len(wall), 1))
     return Capture(
-        counts, wall, sensor, up, up, workload.bin_length, gate=(workload.gate, workload.bins), scan_shape=workload.spots
+        counts,
+        wall,
+        sensor,
+        up,
+        up,
+        workload.bin_length,
+        gate=(workload.gate, workload.bins),
+        scan_shape=workload.spots,
     )
 
 
@@ -193,11 +223,18 @@ class Training:
         self.workload, self.device = workload, torch.device(device)
         settings, sparsity = PROFILES[profile]
         last = workload.depth + (workload.planes - 1) * workload.plane_pitch
-        grid = volume_grid(capture, depth=(workload.depth, last + 1e-9), depth_pitch=workload.plane_pitch, lateral=workload.lateral)
+        grid = volume_grid(
+            capture,
+            depth=(workload.depth, last + 1e-9),
+            depth_pitch=workload.plane_pitch,
+            lateral=workload.lateral,
+        )
         self.pipeline: Pipeline = build_pipeline(
             capture,
             grid,
-            PipelineSettings(threshold=workload.threshold, rays=workload.rays, wavelength=workload.wavelength, **settings),
+            PipelineSettings(
+                threshold=workload.threshold, rays=workload.rays, wavelength=workload.wavelength, **settings
+            ),
         ).to(self.device)
         self.plan: PhasorPlan = self.pipeline.phasor.plan(capture, budget, shards)
         self.criterion = Objective(normalisation(capture), sparsity, LAMBDA_ALBEDO, 64, seed)
@@ -208,7 +245,9 @@ class Training:
         """Propagate the field, match the energy, make the optimiser; seconds that took."""
         began = time.perf_counter()
         self.pipeline.phasor.prepare(self.capture, self.plan)
-        match_energy(self.pipeline, self.capture, torch.from_numpy(self._draw(2 * self.workload.batch)).to(self.device))
+        match_energy(
+            self.pipeline, self.capture, torch.from_numpy(self._draw(2 * self.workload.batch)).to(self.device)
+        )
         self.optimiser = adam(self.pipeline, RATES, list(RATES))
         self.synchronise()
         return time.perf_counter() - began
@@ -240,4 +279,6 @@ class Training:
             torch.cuda.synchronize(self.device)
 
     def _draw(self, count: int) -> np.ndarray:
-        return np.sort(self.random.choice(self.capture.n_spots, min(count, self.capture.n_spots), replace=False))
+        return np.sort(
+            self.random.choice(self.capture.n_spots, min(count, self.capture.n_spots), replace=False)
+        )

@@ -12,7 +12,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, Sampler
 
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 log = logging.getLogger(__name__)
 
@@ -26,7 +26,9 @@ def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
     if every == 0:
         return np.zeros(capture.n_spots, dtype=bool)
     if block < 1 or every < 2:
-        raise UserError(f"heldout.block must be at least 1 and heldout.every 0 or at least 2; found {block} and {every}")
+        raise UserError(
+            f"heldout.block must be at least 1 and heldout.every 0 or at least 2; found {block} and {every}"
+        )
     if capture.scan_shape is None:
         patch = np.arange(capture.n_spots) // block**2
     else:
@@ -66,7 +68,9 @@ class SpotSchedule(Sampler[list[int]]):
 
     def __init__(self, spots: np.ndarray, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> None:
         if batch % ranks:
-            raise UserError(f"a batch of {batch} spots cannot be shared evenly by {ranks} processes; choose a multiple of {ranks}")
+            raise UserError(
+                f"a batch of {batch} spots cannot be shared evenly by {ranks} processes; choose a multiple of {ranks}"
+            )
         self.spots, self.batch, self.seed = spots, min(batch, len(spots) // ranks * ranks), seed
         self.rank, self.ranks, self.epoch = rank, ranks, 0
 
@@ -107,7 +111,9 @@ class CaptureDataModule(L.LightningDataModule):
         seed: of the schedule.
     """
 
-    def __init__(self, capture: Capture, *, batch: int, block: int, every: int, monitor_spots: int, seed: int) -> None:
+    def __init__(
+        self, capture: Capture, *, batch: int, block: int, every: int, monitor_spots: int, seed: int
+    ) -> None:
         super().__init__()
         self.capture, self.batch, self.seed = capture, batch, seed
         self.dataset = SpotDataset(capture)
@@ -116,12 +122,18 @@ class CaptureDataModule(L.LightningDataModule):
         measured = self.dataset.counts.sum(1).numpy() > 0
         if not measured.all():
             empty = int((~measured).sum())
-            log.warning("%d of %d spots hold no counts inside the gate; they are neither fitted nor scored", empty, len(held))
+            log.warning(
+                "%d of %d spots hold no counts inside the gate; they are neither fitted nor scored",
+                empty,
+                len(held),
+            )
         self.train_spots = np.flatnonzero(~held & measured)
         self.heldout_spots = np.flatnonzero(held & measured if every else measured)
         for name, spots in (("to train on", self.train_spots), ("to hold out", self.heldout_spots)):
             if len(spots) == 0:
-                raise UserError(f"no measured spots are left {name}; check the gate and heldout.block, heldout.every")
+                raise UserError(
+                    f"no measured spots are left {name}; check the gate and heldout.block, heldout.every"
+                )
         rng = np.random.default_rng(seed)
         self.monitored = np.sort(rng.permutation(self.heldout_spots)[:monitor_spots])
         self.reference = np.sort(rng.permutation(self.train_spots)[:monitor_spots])

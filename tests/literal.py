@@ -38,7 +38,9 @@ def voxel_centres(origin, pitch, shape) -> Tensor:
     return centres
 
 
-def propagate(counts: Tensor, time: Tensor, laser: Tensor, sensor: Tensor, voxels: Tensor, omega: Tensor) -> Field:
+def propagate(
+    counts: Tensor, time: Tensor, laser: Tensor, sensor: Tensor, voxels: Tensor, omega: Tensor
+) -> Field:
     """The inner integrals of Eq. 2 for every frequency: ``Σ_s e^{-iΩ(d_lv + d_vs)}/(d_lv d_vs) Σ_t H[s, t] e^{iΩt}``."""
     flat = voxels.reshape(-1, 3)
     to_laser = torch.linalg.vector_norm(flat[:, None] - laser, dim=2)
@@ -59,7 +61,13 @@ def frequencies(omega_pf: float, sigma_pf: float, longest: float, widths: float 
 
 
 def intensity(
-    field: Field, omega_pf: Tensor, sigma_pf: Tensor, depth: Tensor, shape, power: float, depth_exponent: float
+    field: Field,
+    omega_pf: Tensor,
+    sigma_pf: Tensor,
+    depth: Tensor,
+    shape,
+    power: float,
+    depth_exponent: float,
 ) -> Tensor:
     """Eq. 1-2 at t = 0: ``|∫ P(Ω) … dΩ|^power · z^depth_exponent``, divided by its maximum."""
     illumination = torch.exp(-0.5 * (field.omega - omega_pf) ** 2 * sigma_pf**2)
@@ -101,7 +109,11 @@ def concentric_directions(n: int) -> Tensor:
 
 def local_frame(normal: Tensor) -> Tensor:
     """Columns x, y, z of a wall point's frame: z the normal, x horizontal."""
-    up = torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE) if abs(normal[1]) < 0.9 else torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE)
+    up = (
+        torch.tensor([0.0, 1.0, 0.0], dtype=DOUBLE)
+        if abs(normal[1]) < 0.9
+        else torch.tensor([1.0, 0.0, 0.0], dtype=DOUBLE)
+    )
     x = torch.linalg.cross(up, normal)
     x = x / x.norm()
     return torch.stack([x, torch.linalg.cross(normal, x), normal], dim=1)
@@ -114,12 +126,20 @@ def interpolate(volume: Tensor, points: Tensor, origin, pitch) -> tuple[Tensor, 
     u, v, w = steps.unbind(1)
     inside = (u >= 0) & (u <= nx - 1) & (v >= 0) & (v <= ny - 1) & (w >= 0) & (w <= nz - 1)
     total = torch.zeros(len(points), dtype=DOUBLE)
-    i0, j0, k0 = (torch.clamp(torch.floor(c.detach()), 0, max(n - 2, 0)).long() for c, n in ((u, nx), (v, ny), (w, nz)))
+    i0, j0, k0 = (
+        torch.clamp(torch.floor(c.detach()), 0, max(n - 2, 0)).long() for c, n in ((u, nx), (v, ny), (w, nz))
+    )
     for di in (0, 1):
         for dj in (0, 1):
             for dk in (0, 1):
-                i, j, k = (i0 + di).clamp_max(nx - 1), (j0 + dj).clamp_max(ny - 1), (k0 + dk).clamp_max(nz - 1)
-                share = (1 - (u - (i0 + di)).abs()) * (1 - (v - (j0 + dj)).abs()) * (1 - (w - (k0 + dk)).abs())
+                i, j, k = (
+                    (i0 + di).clamp_max(nx - 1),
+                    (j0 + dj).clamp_max(ny - 1),
+                    (k0 + dk).clamp_max(nz - 1),
+                )
+                share = (
+                    (1 - (u - (i0 + di)).abs()) * (1 - (v - (j0 + dj)).abs()) * (1 - (w - (k0 + dk)).abs())
+                )
                 total = total + volume[k, i, j] * share
     return torch.where(inside, total, torch.zeros_like(total)), inside
 
@@ -135,7 +155,9 @@ class Points(NamedTuple):
     valid: Tensor
 
 
-def surface(volume, origin, pitch, wall, wall_normal, n, threshold, step, beta, farthest, fine: int | None = None) -> Points:
+def surface(
+    volume, origin, pitch, wall, wall_normal, n, threshold, step, beta, farthest, fine: int | None = None
+) -> Points:
     """Sec. 4.2: every ray, every sample, softargmax over all of them with intensities below the threshold set to zero.
 
     With ``fine`` (not in the paper) the softargmax runs over ``2·fine + 1`` samples from one step before to one step behind the
@@ -144,7 +166,9 @@ def surface(volume, origin, pitch, wall, wall_normal, n, threshold, step, beta, 
     spots = len(wall)
     frames = torch.stack([local_frame(m) for m in wall_normal])
     direction = torch.einsum("sij,rj->sri", frames, concentric_directions(n))
-    distances = ((torch.arange(math.ceil(farthest / step), dtype=DOUBLE) + 0.5) * step).expand(spots, n * n, -1)
+    distances = ((torch.arange(math.ceil(farthest / step), dtype=DOUBLE) + 0.5) * step).expand(
+        spots, n * n, -1
+    )
 
     def along(distances: Tensor) -> Tensor:
         samples = wall[:, None, None] + distances[..., None] * direction[:, :, None]
@@ -256,7 +280,10 @@ def splat_variance(sigma_t: float) -> float:
     total = 0.0
     for phase in range(1000):
         arrival = (phase + 0.5) / 1000
-        weights = [(math.exp(-((k + 0.5 - arrival) ** 2) / (2 * sigma_t**2)), (k + 0.5 - arrival) ** 2) for k in range(-40, 41)]
+        weights = [
+            (math.exp(-((k + 0.5 - arrival) ** 2) / (2 * sigma_t**2)), (k + 0.5 - arrival) ** 2)
+            for k in range(-40, 41)
+        ]
         total += sum(w * d for w, d in weights) / sum(w for w, _ in weights)
     return total / 1000
 
@@ -268,7 +295,11 @@ def data_term(measured: Tensor, rendered: Tensor) -> Tensor:
 
 def sparsity_term(volume: Tensor) -> Tensor:
     """E_Ipf/λ1: mean over pixels of the largest intensity along z."""
-    return torch.stack([volume[:, i, j].max() for i in range(volume.shape[1]) for j in range(volume.shape[2])]).abs().mean()
+    return (
+        torch.stack([volume[:, i, j].max() for i in range(volume.shape[1]) for j in range(volume.shape[2])])
+        .abs()
+        .mean()
+    )
 
 
 def variation_term(albedo: Tensor) -> Tensor:

@@ -8,16 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from nlos_lit.albedo import FreeAlbedo, ResidualAlbedo
 from nlos_lit.capture import Capture
-from nlos_lit.geometry import ImplicitGeometry
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.laser_sensor import LaserSensor
-from nlos_lit.parameters import BoundedParameter
-from nlos_lit.phasor import PhasorImaging
-from nlos_lit.pipeline import Pipeline
-from nlos_lit.renderer import TransientRenderer
-from nlos_lit.scan import volume_grid
+from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
+from nlos_lit.model.albedo import FreeAlbedo, ResidualAlbedo
+from nlos_lit.model.geometry import ImplicitGeometry
+from nlos_lit.model.laser_sensor import LaserSensor
+from nlos_lit.model.parameters import BoundedParameter
+from nlos_lit.model.phasor import PhasorImaging
+from nlos_lit.model.pipeline import Pipeline
+from nlos_lit.model.renderer import TransientRenderer
 
 BIN, BINS, START = 0.02, 128, 0.06
 RAYS, BETA, STEP = 32, 1e3, 0.01
@@ -107,7 +106,9 @@ def build(case: Case) -> SimpleNamespace:
     rng = np.random.default_rng(100 + case.seed)
     laser, laser_normal, sensor, sensor_normal, shape = wall(case, rng)
     counts = rng.poisson(40 * transients(laser, sensor, rng)).astype(np.uint16)
-    capture = Capture(counts, laser, sensor, laser_normal, sensor_normal, BIN, START, gate=case.gate, scan_shape=shape)
+    capture = Capture(
+        counts, laser, sensor, laser_normal, sensor_normal, BIN, START, gate=case.gate, scan_shape=shape
+    )
     if case.scan == "exhaustive":
         grid = volume_grid(capture, depth=(0.38, 0.8), depth_pitch=0.023, lateral=(7, 8))
     elif shape is None:
@@ -121,16 +122,33 @@ def build(case: Case) -> SimpleNamespace:
     torch.manual_seed(case.seed)
     parameters = {name: BoundedParameter(*values, "unit") for name, values in vars(bounds).items()}
     phasor = PhasorImaging(
-        grid, parameters["omega_pf"], parameters["sigma_pf"], power=case.power, depth_exponent=case.depth_exponent
+        grid,
+        parameters["omega_pf"],
+        parameters["sigma_pf"],
+        power=case.power,
+        depth_exponent=case.depth_exponent,
     )
-    albedo = FreeAlbedo(grid.shape, 0.4) if case.albedo == "free" else ResidualAlbedo(grid.shape, case.threshold)
+    albedo = (
+        FreeAlbedo(grid.shape, 0.4) if case.albedo == "free" else ResidualAlbedo(grid.shape, case.threshold)
+    )
     with torch.no_grad():
         albedo.raw += torch.randn(grid.shape) * 0.5
     geometry = ImplicitGeometry(
-        grid, rays=RAYS, threshold=case.threshold, step=STEP, beta=BETA, fine=case.fine or 1, relative=case.fine is not None
+        grid,
+        rays=RAYS,
+        threshold=case.threshold,
+        step=STEP,
+        beta=BETA,
+        fine=case.fine or 1,
+        relative=case.fine is not None,
     )
     renderer = TransientRenderer(
-        n_bins=case.gate[1], bin_length=BIN, t_start=START, rays=RAYS**2, splat_sigma=0.62, conserve_energy=case.conserve
+        n_bins=case.gate[1],
+        bin_length=BIN,
+        t_start=START,
+        rays=RAYS**2,
+        splat_sigma=0.62,
+        conserve_energy=case.conserve,
     )
     laser_sensor = LaserSensor(
         bin_length=BIN, n_bins=case.gate[1], sigma_ls=parameters["sigma_ls"], kappa_s=parameters["kappa_s"],

@@ -19,18 +19,32 @@ sys.path.append(str(ROOT / "benchmarks"))
 import ratio
 import report
 from literal_torch import LiteralIteration
-from workload import LAMBDA_ALBEDO, PROFILES, RATES, TABLE_2, Training, Workload, surface_points, synthetic_capture, tiny
+from workload import (
+    LAMBDA_ALBEDO,
+    PROFILES,
+    RATES,
+    TABLE_2,
+    Training,
+    Workload,
+    surface_points,
+    synthetic_capture,
+    tiny,
+)
 
-from nlos_lit.build import PipelineSettings
+from nlos_lit.model.build import PipelineSettings
 
 SMALL = Workload("small", (12, 12), 96, 1 / 12, 0.025, 0.5, 16, 0.025, batch=3, rays=40)
 
 
 def command(*arguments: str, prelude: str = "") -> subprocess.CompletedProcess:
     script, *rest = arguments
-    program = f"{prelude}\nimport runpy, sys\nsys.argv = {[script, *rest]!r}\nsys.path.insert(0, 'benchmarks')\n"
+    program = (
+        f"{prelude}\nimport runpy, sys\nsys.argv = {[script, *rest]!r}\nsys.path.insert(0, 'benchmarks')\n"
+    )
     program += f"runpy.run_path({script!r}, run_name='__main__')"
-    return subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    return subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +61,17 @@ def errors(training: Training, literal: LiteralIteration) -> dict[str, float]:
 
 def test_literal_iteration_has_the_same_loss_and_gradients(training):
     found = errors(training, LiteralIteration(training))
-    assert set(found) == {"E_H", "loss", "omega_pf", "sigma_pf", "sigma_ls", "kappa_s", "I_l", "eta_s", "albedo"}
+    assert set(found) == {
+        "E_H",
+        "loss",
+        "omega_pf",
+        "sigma_pf",
+        "sigma_ls",
+        "kappa_s",
+        "I_l",
+        "eta_s",
+        "albedo",
+    }
     assert {name: value for name, value in found.items() if not value < 1e-3} == {}
 
 
@@ -56,7 +80,9 @@ def test_ours_is_closer_to_double_precision_than_was_asked(training):
     assert exact.omega.tolist() == training.pipeline.phasor.omega.tolist()
     assert exact.pipeline.albedo.raw.dtype == torch.float64
     assert {name: value for name, value in errors(training, exact).items() if not value < 3e-4} == {}
-    assert training.pipeline.phasor.field.dtype == training.pipeline.albedo.raw.dtype == torch.float32  # a copy was doubled
+    assert (
+        training.pipeline.phasor.field.dtype == training.pipeline.albedo.raw.dtype == torch.float32
+    )  # a copy was doubled
 
 
 def test_the_comparison_sees_a_quarter_of_a_bin(training):
@@ -84,7 +110,10 @@ def test_table_2_is_the_papers():
         "Resolution": (256, 256, 512, 256, 256, 26, 300, 1.33), "SU": (64, 64, 2048, 64, 64, 584, 200, 6.10),
         "44i": (130, 180, 4096, 180, 180, 417, 150, 3.76), "NLOS": (130, 180, 4096, 180, 180, 417, 180, 4.38),
     }  # fmt: skip
-    found = {w.name: (*w.spots, w.bins, *(w.lateral or w.spots), w.planes, w.iterations, w.paper_hours) for w in TABLE_2}
+    found = {
+        w.name: (*w.spots, w.bins, *(w.lateral or w.spots), w.planes, w.iterations, w.paper_hours)
+        for w in TABLE_2
+    }
     assert found == printed
     assert {(w.batch, w.rays) for w in TABLE_2} == {(32, 200)}
 
@@ -97,10 +126,16 @@ def test_profiles_are_those_of_the_configs(profile):
     mine = dataclasses.asdict(PipelineSettings(threshold=model["threshold"], rays=model["rays"], **settings))
     numbers = {name: value for name, value in mine.items() if isinstance(value, (int, float, tuple))}
     assert {
-        n: model[n] for n, v in numbers.items() if model[n] != pytest.approx(list(v) if type(v) is tuple else v, rel=1e-4)
+        n: model[n]
+        for n, v in numbers.items()
+        if model[n] != pytest.approx(list(v) if type(v) is tuple else v, rel=1e-4)
     } == {}
     assert {n: model[n] for n, v in mine.items() if n not in numbers and model[n] != v} == {}
-    assert (model["rates"], model["lambda_albedo"], model["lambda_sparsity"]) == (RATES, LAMBDA_ALBEDO, sparsity)
+    assert (model["rates"], model["lambda_albedo"], model["lambda_sparsity"]) == (
+        RATES,
+        LAMBDA_ALBEDO,
+        sparsity,
+    )
 
 
 def test_surface_lies_in_the_volume_and_counts_average_what_was_asked():
@@ -113,7 +148,19 @@ def test_surface_lies_in_the_volume_and_counts_average_what_was_asked():
 
 
 def test_gpu_benchmark_needs_torch_and_numpy_alone():
-    blocked = ("lightning", "hydra", "omegaconf", "open3d", "psutil", "rich", "scipy", "matplotlib", "pooch", "tensorboard", "h5py")
+    blocked = (
+        "lightning",
+        "hydra",
+        "omegaconf",
+        "open3d",
+        "psutil",
+        "rich",
+        "scipy",
+        "matplotlib",
+        "pooch",
+        "tensorboard",
+        "h5py",
+    )
     prelude = f"import sys\nfor name in {blocked!r}: sys.modules[name] = None"
     done = command("benchmarks/gpu.py", "device=cpu", "sizes=tiny", "names=Bunny,NLOS", prelude=prelude)
     assert done.returncode == 0, done.stderr[-2000:]
@@ -134,19 +181,30 @@ def test_table_2_command_at_a_tiny_size():
     assert done.returncode == 0, done.stderr[-2000:]
     row = json.loads(done.stdout.splitlines()[-1])
     small = tiny(next(w for w in TABLE_2 if w.name == "44i"))
-    assert (row["spots"], row["bins"], row["complete"], row["measured_iterations"]) == ([16, 22], 128, True, small.iterations)
+    assert (row["spots"], row["bins"], row["complete"], row["measured_iterations"]) == (
+        [16, 22],
+        128,
+        True,
+        small.iterations,
+    )
     assert row["total_s"] > row["setup_s"] > 0
 
 
 def test_two_processes_hand_over_the_gradients_and_the_volume_where_they_divide_the_field():
-    script = [sys.executable, "benchmarks/ddp.py", "sizes=tiny"]  # as a file: the processes it spawns import it
+    script = [
+        sys.executable,
+        "benchmarks/ddp.py",
+        "sizes=tiny",
+    ]  # as a file: the processes it spawns import it
     done = subprocess.run(script, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     row = json.loads(done.stdout.splitlines()[-1])
     whole, divided = row["whole"], row["divided"]
     voxels = 8 * 8 * 12
     assert whole["counted_bytes"] == whole["expected_bytes"] == 4 * (voxels + 6)
-    assert divided["counted_bytes"] == divided["expected_bytes"] == 4 * (voxels + 6) + 4 * (voxels // 2 + voxels)
+    assert (
+        divided["counted_bytes"] == divided["expected_bytes"] == 4 * (voxels + 6) + 4 * (voxels // 2 + voxels)
+    )
     assert 2 * divided["field_bytes"] == whole["field_bytes"]
     assert max(whole["difference"], divided["difference"]) < 1e-5
 

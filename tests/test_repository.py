@@ -22,7 +22,9 @@ SUBMODULES = {f"nlos_lit/{name}.py" for name in ("phasor", "geometry", "renderer
 
 
 def _tracked() -> list[str]:
-    listed = subprocess.run(["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True, check=False)
+    listed = subprocess.run(
+        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True, check=False
+    )
     if listed.returncode:
         pytest.skip("not a git checkout: these rules are about tracked files", allow_module_level=True)
     return [name for name in listed.stdout.split("\0") if name and (ROOT / name).exists()]
@@ -31,7 +33,9 @@ def _tracked() -> list[str]:
 TRACKED = _tracked()
 MODULES = [name for name in TRACKED if name.endswith(".py")]
 PRODUCT = [name for name in MODULES if not name.startswith("tests/")]
-CORE = [name for name in PRODUCT if name in SUBMODULES or {"functional", "baselines"} & set(Path(name).parts[:-1])]
+CORE = [
+    name for name in PRODUCT if name in SUBMODULES or {"functional", "baselines"} & set(Path(name).parts[:-1])
+]
 
 
 def syntax(name: str) -> ast.Module:
@@ -89,7 +93,11 @@ def test_no_module_imports_open3d_when_it_is_imported():
     """Inside functions only, so that everything but meshes and ray casting works without its system libraries."""
     offenders = []
     for name in MODULES:
-        body = [node for node in syntax(name).body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))]
+        body = [
+            node
+            for node in syntax(name).body
+            if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test))
+        ]
         top = [node for node in body if not isinstance(node, (ast.FunctionDef, ast.ClassDef))]
         if "open3d" in set().union(*map(imported, top), set()):
             offenders.append(name)
@@ -98,7 +106,10 @@ def test_no_module_imports_open3d_when_it_is_imported():
 
 PLACES = re.compile(r"(?<![\w./~$}-])/(?:work|root|home)(?:/|\b)")
 HOSTS = re.compile(
-    "|".join(name.replace("_", r"\.") for name in ("pypi_org", "pythonhosted_org", "download_pytorch_org", "anaconda_org"))
+    "|".join(
+        name.replace("_", r"\.")
+        for name in ("pypi_org", "pythonhosted_org", "download_pytorch_org", "anaconda_org")
+    )
 )
 
 
@@ -164,7 +175,11 @@ def test_unsafe_calls_are_recognised(code, safe):
 
 def test_every_declared_dependency_is_pinned():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if line and not line.startswith("#")]
+    lines = [
+        line
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
     pins = [Requirement(line) for line in lines]
     assert all(re.fullmatch(r"==[^*]+", str(pin.specifier)) for pin in pins)
     versions = {canonicalize_name(pin.name): str(pin.specifier)[2:] for pin in pins}
@@ -182,6 +197,8 @@ def test_scripts_run(name):
 
 def test_ci_runs_the_tests_the_readme_names():
     assert "make test" in (ROOT / ".ci/run").read_text()
-    dry = subprocess.run(["make", "-n", "-C", str(ROOT), "test", "VENV=nowhere"], capture_output=True, text=True, check=True).stdout
+    dry = subprocess.run(
+        ["make", "-n", "-C", str(ROOT), "test", "VENV=nowhere"], capture_output=True, text=True, check=True
+    ).stdout
     assert "scripts/setup.sh" in dry
     assert dry.index("scripts/setup.sh") < dry.index("nowhere/bin/python -m pytest")

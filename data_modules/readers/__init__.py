@@ -13,7 +13,7 @@ from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from data_modules.readers.ytal_write import write_capture
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 __all__ = ["READERS", "ReaderOptions", "detect_format", "read_capture", "write_capture"]
 
@@ -49,7 +49,9 @@ def _named(fmt: str) -> ModuleType:
     for reader in READERS:
         if fmt == reader.NAME:
             return reader
-    raise CaptureError(f"unknown format {fmt!r}; choose auto or one of {', '.join(reader.NAME for reader in READERS)}")
+    raise CaptureError(
+        f"unknown format {fmt!r}; choose auto or one of {', '.join(reader.NAME for reader in READERS)}"
+    )
 
 
 def _recognise(contents: Contents) -> ModuleType:
@@ -57,4 +59,6 @@ def _recognise(contents: Contents) -> ModuleType:
         if reader.matches(contents):
             return reader
     known = "; ".join(f"{reader.NAME}: {reader.EXPECTS}" for reader in READERS)
-    raise CaptureError(f"{contents.path.name} holds {contents.summary()}, which is none of the known formats ({known})")
+    raise CaptureError(
+        f"{contents.path.name} holds {contents.summary()}, which is none of the known formats ({known})"
+    )

@@ -9,7 +9,7 @@ import numpy as np
 
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import SPEED_OF_LIGHT, Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 COMMON_OPTIONS = frozenset({"t_start", "gate", "flip_x", "flip_y", "swap_xy", "scan_order", "exposure_s"})
 DIRECT_PULSE_PATH = 0.3  # m; a pulse later than this is not the wall's own return
@@ -55,7 +55,10 @@ def assemble(
     steps = list(steps or [])
     spots = counts.shape[0]
     up = np.broadcast_to([0.0, 0.0, 1.0], (spots, 3))
-    vectors = [np.asarray(v, dtype=np.float64) for v in (laser, sensor, _or(laser_normal, up), _or(sensor_normal, up))]
+    vectors = [
+        np.asarray(v, dtype=np.float64)
+        for v in (laser, sensor, _or(laser_normal, up), _or(sensor_normal, up))
+    ]
     for name in ("swap_xy", "flip_x", "flip_y"):
         if getattr(options, name):
             vectors = [_mirror(vector, name) for vector in vectors]
@@ -154,7 +157,9 @@ def counted(values: np.ndarray) -> bool:
     return values.dtype.kind in "ui" or bool(np.array_equal(values, np.rint(values)))
 
 
-def acquisition_order(wanted: str | np.ndarray | None, shape: tuple[int, ...] | None, spots: int) -> np.ndarray | None:
+def acquisition_order(
+    wanted: str | np.ndarray | None, shape: tuple[int, ...] | None, spots: int
+) -> np.ndarray | None:
     """``[S]`` rank of each spot, in the file's order of spots; None where nothing was said."""
     if wanted is None:
         return None
@@ -163,14 +168,18 @@ def acquisition_order(wanted: str | np.ndarray | None, shape: tuple[int, ...] | 
     if wanted == "raster":
         return np.arange(spots)
     if shape is None or len(shape) != 2:
-        raise CaptureError(f"scan_order {wanted!r} needs a file with one scanned grid; give each spot's rank instead")
+        raise CaptureError(
+            f"scan_order {wanted!r} needs a file with one scanned grid; give each spot's rank instead"
+        )
     raster = np.arange(spots).reshape(shape)
     if wanted == "serpentine":
         raster[1::2] = raster[1::2, ::-1]
         return raster.ravel()
     if wanted == "columns":
         return np.arange(spots).reshape(shape[::-1]).T.ravel()
-    raise CaptureError(f"scan_order must be raster, serpentine, columns or an array of ranks; found {wanted!r}")
+    raise CaptureError(
+        f"scan_order must be raster, serpentine, columns or an array of ranks; found {wanted!r}"
+    )
 
 
 def remove_delays(counts: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, float, str]:
@@ -221,7 +230,9 @@ def direct_pulse(mean: np.ndarray, bin_length: float, t_start: float = 0.0) -> i
     return peak if abs(t_start + (peak + 0.5) * bin_length) < DIRECT_PULSE_PATH else None
 
 
-def gate_after_direct_pulse(counts: np.ndarray, bin_length: float, t_start: float = 0.0) -> tuple[tuple[int, int], str]:
+def gate_after_direct_pulse(
+    counts: np.ndarray, bin_length: float, t_start: float = 0.0
+) -> tuple[tuple[int, int], str]:
     """Bins behind the wall's own return.
 
     The mean transient has a valley between the pulse's tail and the largest later rise above the lowest level so far. The gate
@@ -262,7 +273,9 @@ def bin_length_of(bin_width_ps: float) -> float:
 
 def _permutation(rank: np.ndarray, spots: int) -> np.ndarray:
     if rank.shape != (spots,):
-        raise CaptureError(f"scan_order must give one rank for each of the {spots} spots; found shape {rank.shape}")
+        raise CaptureError(
+            f"scan_order must give one rank for each of the {spots} spots; found shape {rank.shape}"
+        )
     return rank
 
 

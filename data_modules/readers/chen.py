@@ -11,7 +11,7 @@ from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from data_modules.readers.radiance import read_radiance
 from nlos_lit.capture import SPEED_OF_LIGHT, Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "chen"
 DESCRIPTION = (
@@ -32,13 +32,17 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     """Grey value of each pixel by Rec. 601 luma (the renders are grey); frames are time bins from path zero."""
     container = open_contents(path).container
     if container == "mp4":
-        raise CaptureError(f"{path.name} is a video, lossy and 8-bit; read the renderer's own light-1-*.hdr instead")
+        raise CaptureError(
+            f"{path.name} is a video, lossy and 8-bit; read the renderer's own light-1-*.hdr instead"
+        )
     if container != "radiance":
         raise CaptureError(f"{path.name} is not {EXPECTS}; found a {container} file")
     picture = read_radiance(path)
     rows, side = picture.shape[:2]
     if rows % side:
-        raise CaptureError(f"{path.name} is {rows} × {side} pixels; expected T·N rows of N pixels, one N × N frame a time bin")
+        raise CaptureError(
+            f"{path.name} is {rows} × {side} pixels; expected T·N rows of N pixels, one N × N frame a time bin"
+        )
     frames = (picture @ np.array([0.299, 0.587, 0.114], dtype=np.float32)).reshape(rows // side, side * side)
     length = bin_length_of(options.bin_width_ps) if options.bin_width_ps else BIN_LENGTH
     sides = options.wall_sides or (WALL_SIZE, WALL_SIZE)
@@ -53,5 +57,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         bin_length=length,
         shape=(side, side),
         is_counts=False,
-        steps=[f"bins of {1e12 * length / SPEED_OF_LIGHT:.4g} ps, wall {sides[0]:g} m × {sides[1]:g} m, grey by Rec. 601 luma"],
+        steps=[
+            f"bins of {1e12 * length / SPEED_OF_LIGHT:.4g} ps, wall {sides[0]:g} m × {sides[1]:g} m, grey by Rec. 601 luma"
+        ],
     )

@@ -10,7 +10,7 @@ from data_modules.readers.assemble import COMMON_OPTIONS, assemble, bin_length_o
 from data_modules.readers.contents import Contents, open_contents, open_folder
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "cid"
 DESCRIPTION = "C_i / C_d / sub_Sig .mat files: bins of 16 ps, wall coordinates in 0.01 m, counts; second column +x, third +y"
@@ -60,7 +60,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     )
 
 
-def _world(laser: np.ndarray, sensor: np.ndarray, options: ReaderOptions) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
+def _world(
+    laser: np.ndarray, sensor: np.ndarray, options: ReaderOptions
+) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
     """Columns (depth, horizontal, vertical) to (x, y, z) in metres, the scanned rectangle's middle at the origin."""
     scanned = laser if np.ptp(laser, axis=0).max() >= np.ptp(sensor, axis=0).max() else sensor
     low, high = scanned[:, 1:].min(axis=0), scanned[:, 1:].max(axis=0)
@@ -74,7 +76,14 @@ def _world(laser: np.ndarray, sensor: np.ndarray, options: ReaderOptions) -> tup
     middle = (low + high) / 2
 
     def turn(points: np.ndarray) -> np.ndarray:
-        return np.stack([(points[:, 1] - middle[0]) * scale[0], (points[:, 2] - middle[1]) * scale[1], points[:, 0] * UNIT], axis=1)
+        return np.stack(
+            [
+                (points[:, 1] - middle[0]) * scale[0],
+                (points[:, 2] - middle[1]) * scale[1],
+                points[:, 0] * UNIT,
+            ],
+            axis=1,
+        )
 
     return turn(laser), turn(sensor), scale
 

@@ -17,7 +17,7 @@ import numpy as np
 import psutil
 
 from data_modules.readers.mat5 import list_mat5, read_mat5
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
@@ -70,7 +70,10 @@ class Contents:
         """The names and shapes, for messages."""
         if not self.entries:
             return f"no named arrays ({self.container} file)"
-        shown = [f"{name} {'×'.join(map(str, entry.shape)) or 'scalar'}" for name, entry in list(self.entries.items())[:12]]
+        shown = [
+            f"{name} {'×'.join(map(str, entry.shape)) or 'scalar'}"
+            for name, entry in list(self.entries.items())[:12]
+        ]
         rest = len(self.entries) - len(shown)
         return ", ".join(shown) + (f" and {rest} more" if rest > 0 else "")
 
@@ -91,7 +94,9 @@ class Contents:
             values = self._read_hdf5(name) if self.container == "hdf5" else read_mat5(self.path, name)
         values = np.asarray(values)
         if values.dtype.kind not in "uifb":
-            raise CaptureError(f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})")
+            raise CaptureError(
+                f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})"
+            )
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
 
     def counts(self, name: str) -> np.ndarray:
@@ -100,7 +105,9 @@ class Contents:
         if values.size == 0:
             raise CaptureError(f"{name} in {self.path.name} is empty ({'×'.join(map(str, values.shape))})")
         if not (np.isfinite(values.min()) and np.isfinite(values.max())):
-            raise CaptureError(f"{name} in {self.path.name} holds NaN or infinite values; clean the file or mask those spots")
+            raise CaptureError(
+                f"{name} in {self.path.name} holds NaN or infinite values; clean the file or mask those spots"
+            )
         return values
 
     def places(self, name: str) -> np.ndarray:
@@ -114,7 +121,9 @@ class Contents:
         """A finite number stored as an array of one element."""
         values = self.read(name)
         if values.size != 1 or not np.isfinite(values).all():
-            raise CaptureError(f"{name} in {self.path.name} must be one finite number; found {values.size} values")
+            raise CaptureError(
+                f"{name} in {self.path.name} must be one finite number; found {values.size} values"
+            )
         return float(values.reshape(()))
 
     def text(self, name: str) -> str:
@@ -173,8 +182,12 @@ def open_contents(path: str | Path) -> Contents:
     if head[4:8] == b"ftyp":
         return Contents(path, "mp4", {})
     if head.startswith(b"MATLAB 7.3"):
-        raise CaptureError(f"{path.name} begins like a MATLAB v7.3 file but holds no HDF5 data; it is damaged or truncated")
-    raise CaptureError(f"{path.name} is neither HDF5, MATLAB nor Radiance HDR; found a file that begins with {head[:8]!r}")
+        raise CaptureError(
+            f"{path.name} begins like a MATLAB v7.3 file but holds no HDF5 data; it is damaged or truncated"
+        )
+    raise CaptureError(
+        f"{path.name} is neither HDF5, MATLAB nor Radiance HDR; found a file that begins with {head[:8]!r}"
+    )
 
 
 def open_folder(path: Path) -> Contents:
@@ -208,7 +221,9 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
                     shape = dataset.shape or ()
                     entries[label] = Entry(shape, numeric, math.prod(shape) * dataset.dtype.itemsize)
     if matlab:
-        entries = {name: Entry(entry.shape[::-1], entry.numeric, entry.size) for name, entry in entries.items()}
+        entries = {
+            name: Entry(entry.shape[::-1], entry.numeric, entry.size) for name, entry in entries.items()
+        }
     return Contents(path, "hdf5", entries, matlab)
 
 

@@ -17,7 +17,7 @@ from data_modules.readers.assemble import (
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "fk"
 DESCRIPTION = "f-k migration .mat v7.3, confocal: bins of 32 ps, wall 2 m × 2 m, counts; rows from the top (-y), columns along -x"
@@ -36,7 +36,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents = open_contents(path)
     contents.require("meas")
     if contents.ndim("meas") != 3:
-        raise CaptureError(f"meas in {path.name} must be [rows, columns, bins]; found {contents.entries['meas'].shape}")
+        raise CaptureError(
+            f"meas in {path.name} must be [rows, columns, bins]; found {contents.entries['meas'].shape}"
+        )
     width = options.bin_width_ps or BIN_WIDTH_PS
     sides = options.wall_sides or (WALL_SIZE, WALL_SIZE)
     data = contents.counts("meas")
@@ -79,5 +81,7 @@ def _delays(contents: Contents, shape: tuple[int, int]) -> np.ndarray | None:
     if delays.size == 0:
         return None
     if delays.shape != shape:
-        raise CaptureError(f"tofgrid in {source.path.name} is {delays.shape} where meas scans {shape}; use the one of this scene")
+        raise CaptureError(
+            f"tofgrid in {source.path.name} is {delays.shape} where meas scans {shape}; use the one of this scene"
+        )
     return delays.ravel().astype(np.float64)

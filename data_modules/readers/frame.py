@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 
 def wall_rotation(normals: np.ndarray) -> np.ndarray:
@@ -15,7 +15,9 @@ def wall_rotation(normals: np.ndarray) -> np.ndarray:
     mean = normals.reshape(-1, 3).astype(np.float64).mean(axis=0)
     length = np.linalg.norm(mean)
     if not length > 0.1:
-        raise CaptureError("the wall's normals cancel or are missing; they must point from the wall to the hidden scene")
+        raise CaptureError(
+            "the wall's normals cancel or are missing; they must point from the wall to the hidden scene"
+        )
     forward = mean / length
     if forward[2] > 1 - 1e-9:
         return np.eye(3)

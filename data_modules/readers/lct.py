@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from data_modules.readers.assemble import (
-    COMMON_OPTIONS,
-    assemble,
-    bin_length_of,
-    cell_centres,
-    wall_points,
-)
+from data_modules.readers.assemble import COMMON_OPTIONS, assemble, bin_length_of, cell_centres, wall_points
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "lct"
-DESCRIPTION = "LCT .mat, confocal: bins of 4 ps, wall side 2·width, counts; first axis along +x, second along -y"
+DESCRIPTION = (
+    "LCT .mat, confocal: bins of 4 ps, wall side 2·width, counts; first axis along +x, second along -y"
+)
 EXPECTS = "rect_data [nx, ny, T] and width"
 OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
 BIN_WIDTH_PS = 4.0
@@ -32,7 +28,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents = open_contents(path)
     contents.require("rect_data")
     if contents.ndim("rect_data") != 3:
-        raise CaptureError(f"rect_data in {path.name} must be [nx, ny, bins]; found {contents.entries['rect_data'].shape}")
+        raise CaptureError(
+            f"rect_data in {path.name} must be [nx, ny, bins]; found {contents.entries['rect_data'].shape}"
+        )
     sides = options.wall_sides
     if sides is None:
         half = contents.scalar("width")

@@ -17,9 +17,20 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}  # mi* codes
+_TYPES = {
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+}  # mi* codes
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15
 _STRUCT, _NUMBERS = 2, range(6, 16)  # mx* classes
 _INFLATION = 1100  # deflate cannot exceed 1032-fold (zlib.net/zlib_tech.html)

@@ -10,7 +10,7 @@ from numbers import Integral, Real
 
 import numpy as np
 
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,11 @@ class ReaderOptions:
         if self.t_start is not None and not (isinstance(self.t_start, Real) and math.isfinite(self.t_start)):
             raise CaptureError(f"t_start must be a path length in metres; found {self.t_start!r}")
         if self.gate is not None:
-            if not isinstance(self.gate, Sequence) or len(self.gate) != 2 or not all(isinstance(n, Integral) for n in self.gate):
+            if (
+                not isinstance(self.gate, Sequence)
+                or len(self.gate) != 2
+                or not all(isinstance(n, Integral) for n in self.gate)
+            ):
                 raise CaptureError(f"gate must be (first bin, last bin); found {self.gate!r}")
             object.__setattr__(self, "gate", (int(self.gate[0]), int(self.gate[1])))
 
@@ -70,7 +74,11 @@ class ReaderOptions:
         """``wall_size`` as (x, y), m."""
         if self.wall_size is None:
             return None
-        return tuple(self.wall_size) if isinstance(self.wall_size, Sequence) else (self.wall_size, self.wall_size)
+        return (
+            tuple(self.wall_size)
+            if isinstance(self.wall_size, Sequence)
+            else (self.wall_size, self.wall_size)
+        )
 
 
 def _positive(name: str, value: float | None) -> None:

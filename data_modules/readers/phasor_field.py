@@ -10,7 +10,7 @@ from data_modules.readers.assemble import COMMON_OPTIONS, assemble, bin_length_o
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "phasor_field"
 DESCRIPTION = (
@@ -34,15 +34,21 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents = open_contents(path)
     contents.require("rect_data", "SPAD_index")
     if contents.ndim("rect_data") != 3:
-        raise CaptureError(f"rect_data in {path.name} must be [rows, columns, bins]; found {contents.entries['rect_data'].shape}")
+        raise CaptureError(
+            f"rect_data in {path.name} must be [rows, columns, bins]; found {contents.entries['rect_data'].shape}"
+        )
     width = options.bin_width_ps or 1e12 * contents.scalar("ts")
     if not 0.1 < width < 1e4:
-        raise CaptureError(f"ts in {path.name} makes bins of {width:g} ps; expected seconds, about 4e-12 (or give bin_width_ps)")
+        raise CaptureError(
+            f"ts in {path.name} makes bins of {width:g} ps; expected seconds, about 4e-12 (or give bin_width_ps)"
+        )
     data = contents.counts("rect_data")
     rows, columns, bins = data.shape
     row, column = _detector(contents, rows, columns)
     across, down = _spacing(contents, options, rows, columns)
-    points = wall_points(down * ((rows - 1) / 2 - np.arange(rows)), across * (np.arange(columns) - (columns - 1) / 2), "yx")
+    points = wall_points(
+        down * ((rows - 1) / 2 - np.arange(rows)), across * (np.arange(columns) - (columns - 1) / 2), "yx"
+    )
     counts = data.reshape(rows * columns, bins)
     return assemble(
         path,
@@ -54,17 +60,23 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         bin_length=bin_length_of(width),
         shape=(rows, columns),
         behind_pulse=True,
-        steps=[f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column {column + 1}"],
+        steps=[
+            f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column {column + 1}"
+        ],
     )
 
 
 def _detector(contents: Contents, rows: int, columns: int) -> tuple[int, int]:
     index = contents.read("SPAD_index").ravel()
     if index.size != 2 or not np.isfinite(index).all():
-        raise CaptureError(f"SPAD_index in {contents.path.name} must be (row, column); found {index.size} values")
+        raise CaptureError(
+            f"SPAD_index in {contents.path.name} must be (row, column); found {index.size} values"
+        )
     row, column = (int(value) - 1 for value in index)
     if not (0 <= row < rows and 0 <= column < columns):
-        raise CaptureError(f"SPAD_index {tuple(index)} in {contents.path.name} lies outside the {rows} × {columns} scan")
+        raise CaptureError(
+            f"SPAD_index {tuple(index)} in {contents.path.name} lies outside the {rows} × {columns} scan"
+        )
     return row, column
 
 
@@ -79,5 +91,7 @@ def _spacing(contents: Contents, options: ReaderOptions, rows: int, columns: int
         aperture = contents.read("aperturefullsize").ravel()
         spacing = float(aperture[0]) / max(rows - 1, 1) if aperture.size else 0.0
     if not (np.isfinite(spacing) and spacing > 0):
-        raise CaptureError(f"the spot spacing in {contents.path.name} must be a positive length; found {spacing}; give wall_size")
+        raise CaptureError(
+            f"the spot spacing in {contents.path.name} must be a positive length; found {spacing}; give wall_size"
+        )
     return spacing, spacing

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 _SIZE_LINE = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
 
@@ -22,14 +22,18 @@ def read_radiance(path: Path) -> np.ndarray:
     header = data[:65536]
     size = _SIZE_LINE.search(header)
     if size is None or b"32-bit_rle_xyze" in header[: size.start()]:
-        raise CaptureError(f"{path.name} is not an RGBE picture from the top left ('-Y rows +X columns'); save it so")
+        raise CaptureError(
+            f"{path.name} is not an RGBE picture from the top left ('-Y rows +X columns'); save it so"
+        )
     rows, columns = int(size[1]), int(size[2])
     if rows < 1 or columns < 1:
         raise CaptureError(f"{path.name} is a picture of {rows} × {columns} pixels")
     body = memoryview(data)[size.end() :]
     least = 4 * (2 * (columns // 127)) if 8 <= columns < 32768 else 4 * columns
     if rows * least > len(body):
-        raise CaptureError(f"{path.name} is cut short: {len(body)} bytes cannot hold {rows} × {columns} pixels")
+        raise CaptureError(
+            f"{path.name} is cut short: {len(body)} bytes cannot hold {rows} × {columns} pixels"
+        )
     if len(body) == 4 * rows * columns and not _is_run_length(body, columns):
         pixels = np.frombuffer(body, np.uint8).reshape(rows, columns, 4)
     else:
@@ -50,7 +54,9 @@ def _decode_runs(body: memoryview, rows: int, columns: int, path: Path) -> np.nd
     at = 0
     for row in range(rows):
         if bytes(body[at : at + 4]) != lead:
-            raise CaptureError(f"{path.name} is damaged at row {row}: expected a run-length scanline of {columns} pixels")
+            raise CaptureError(
+                f"{path.name} is damaged at row {row}: expected a run-length scanline of {columns} pixels"
+            )
         at += 4
         for channel in range(4):
             start, end = channel * columns, (channel + 1) * columns
@@ -66,7 +72,9 @@ def _decode_runs(body: memoryview, rows: int, columns: int, path: Path) -> np.nd
                     piece = body[at + 1 : at + 1 + number]
                     at += 1 + number
                 if number == 0 or start + number > end or len(piece) != number:
-                    raise CaptureError(f"{path.name} is damaged at row {row}: a run leaves the scanline or the file")
+                    raise CaptureError(
+                        f"{path.name} is damaged at row {row}: a run leaves the scanline or the file"
+                    )
                 line[start : start + number] = piece
                 start += number
         pixels[row] = np.frombuffer(line, np.uint8).reshape(4, columns).T

@@ -18,7 +18,7 @@ from data_modules.readers.assemble import (
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "tsai_ahn"
 DESCRIPTION = "Tsai / Ahn .mat: delta (m) and points from NLOSDATA; other forms need bin_width_ps, and meas also wall_size"
@@ -46,8 +46,14 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
     """The hidden object is at the file's origin and the wall at z = target_dist: a half turn about y brings it to our frame."""
     laser, sensor = _points(contents, "NLOSDATA.l"), _points(contents, "NLOSDATA.s")
-    distance = contents.scalar("NLOSDATA.target_dist") if "NLOSDATA.target_dist" in contents else float(laser[:, 2].mean())
-    length = bin_length_of(options.bin_width_ps) if options.bin_width_ps else contents.scalar("NLOSDATA.delta")
+    distance = (
+        contents.scalar("NLOSDATA.target_dist")
+        if "NLOSDATA.target_dist" in contents
+        else float(laser[:, 2].mean())
+    )
+    length = (
+        bin_length_of(options.bin_width_ps) if options.bin_width_ps else contents.scalar("NLOSDATA.delta")
+    )
     confocal = bool(contents.scalar("NLOSDATA.is_confocal")) if "NLOSDATA.is_confocal" in contents else False
     data = contents.counts("NLOSDATA.transient")
     spots, shape = (len(laser), None) if confocal else (len(laser) * len(sensor), None)
@@ -81,7 +87,9 @@ def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capt
         bin_length=length,
         shape=shape,
         listed=order,
-        steps=[f"NLOSDATA: bins of {length:g} m, wall at {distance:g} m from the file's origin, turned about y"],
+        steps=[
+            f"NLOSDATA: bins of {length:g} m, wall at {distance:g} m from the file's origin, turned about y"
+        ],
     )
 
 
@@ -89,11 +97,15 @@ def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Captur
     """Confocal points in the wall plane z = 0, x and y as they are; LCT data re-saved in this form have 4 ps bins."""
     _ask(path, options, "bin_width_ps")
     if options.wall_size is not None:
-        raise CaptureError(f"wall_size has no meaning for {path.name}: its lighting array gives each wall point")
+        raise CaptureError(
+            f"wall_size has no meaning for {path.name}: its lighting array gives each wall point"
+        )
     points = _points(contents, "lighting")
     counts = contents.counts("transient")
     if counts.ndim != 2 or len(counts) != len(points):
-        raise CaptureError(f"transient in {path.name} is {counts.shape}; expected [{len(points)}, T], one row a lighting point")
+        raise CaptureError(
+            f"transient in {path.name} is {counts.shape}; expected [{len(points)}, T], one row a lighting point"
+        )
     order, shape = grid_of(points) or (np.arange(len(points)), None)
     return assemble(
         path,
@@ -113,7 +125,9 @@ def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Captur
     """Nothing says how the axes of such a cube run: taken as x, then y, both growing; flip_x, flip_y and swap_xy say otherwise."""
     contents.require("meas")
     if contents.ndim("meas") != 3:
-        raise CaptureError(f"meas in {path.name} must be [x, y, bins]; found {contents.entries['meas'].shape}")
+        raise CaptureError(
+            f"meas in {path.name} must be [x, y, bins]; found {contents.entries['meas'].shape}"
+        )
     _ask(path, options, "bin_width_ps", "wall_size")
     data = contents.counts("meas")
     nx, ny, bins = data.shape
@@ -135,7 +149,9 @@ def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Captur
 def _points(contents: Contents, name: str) -> np.ndarray:
     points = contents.places(name)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise CaptureError(f"{name} in {contents.path.name} must be points [N, 3]; found shape {points.shape}")
+        raise CaptureError(
+            f"{name} in {contents.path.name} must be points [N, 3]; found shape {points.shape}"
+        )
     return points
 
 

@@ -14,7 +14,7 @@ from data_modules.readers.frame import device_distances, wall_rotation
 from data_modules.readers.options import ReaderOptions
 from data_modules.readers.ytal_write import T_LI_SI, T_LX_LY_SX_SY, T_SI, T_SX_SY, own_facts
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "ytal"
 DESCRIPTION = "y-tal .hdf5, any scan: bin length and wall points (m) from the file, expected values unless written by this project"
@@ -46,12 +46,20 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     t_start = contents.scalar("t_start") if contents.ndim("t_start") >= 0 else 0.0
     text = contents.text("scene_info")
     ours = own_facts(text, path)
-    geometry = {"laser": laser, "sensor": sensor, "laser_normal": normals[0], "sensor_normal": normals[1], "bin_length": length}
+    geometry = {
+        "laser": laser,
+        "sensor": sensor,
+        "laser_normal": normals[0],
+        "sensor_normal": normals[1],
+        "bin_length": length,
+    }
     if ours is not None:
         return _own(path, options, ours, counts, geometry, t_start)
     steps: list[str] = []
     devices = {name: _device(contents, name) for name in ("laser_xyz", "sensor_xyz")}
-    if contents.ndim("t_accounts_first_and_last_bounces") >= 0 and contents.scalar("t_accounts_first_and_last_bounces"):
+    if contents.ndim("t_accounts_first_and_last_bounces") >= 0 and contents.scalar(
+        "t_accounts_first_and_last_bounces"
+    ):
         if devices["laser_xyz"] is None or devices["sensor_xyz"] is None:
             raise CaptureError(
                 f"{path.name} counts time from laser to sensor but does not say where they are (laser_xyz, sensor_xyz)"
@@ -70,7 +78,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
             geometry[name] = geometry[name] @ rotation.T
         steps.append("turned so that the wall faces +z")
-    facts: dict[str, Any] = {name: [float(v) for v in place] for name, place in devices.items() if place is not None}
+    facts: dict[str, Any] = {
+        name: [float(v) for v in place] for name, place in devices.items() if place is not None
+    }
     if 0 < len(text) <= _KEPT_TEXT:
         facts["scene_info"] = text
     return assemble(
@@ -88,13 +98,25 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 
 
 def _own(
-    path: Path, options: ReaderOptions, ours: dict[str, Any], counts: np.ndarray, geometry: dict[str, Any], t_start: float
+    path: Path,
+    options: ReaderOptions,
+    ours: dict[str, Any],
+    counts: np.ndarray,
+    geometry: dict[str, Any],
+    t_start: float,
 ) -> Capture:
     """What `write_capture` wrote, exactly as it was, then the options."""
     if options.raw_scale is not None:
-        raise CaptureError(f"raw_scale has no meaning for {path.name}: it was written by this project, free of that scale")
+        raise CaptureError(
+            f"raw_scale has no meaning for {path.name}: it was written by this project, free of that scale"
+        )
     provenance = ours.pop("provenance")
-    fields = {**geometry, "counts": counts.astype(ours.pop("dtype")), "t_start": t_start, "gate": ours.pop("gate")}
+    fields = {
+        **geometry,
+        "counts": counts.astype(ours.pop("dtype")),
+        "t_start": t_start,
+        "gate": ours.pop("gate"),
+    }
     if not options.given:
         return Capture(**fields, **ours, provenance=provenance)
     shape = ours.pop("scan_shape")
@@ -110,7 +132,9 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     if contents.ndim("H_format") >= 0:
         kind = int(contents.scalar("H_format"))
     if _AXES.get(kind) != values.ndim:
-        raise CaptureError(f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: T_Li_Si)")
+        raise CaptureError(
+            f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: T_Li_Si)"
+        )
     laser, sensor = (contents.places(key) for key in ("laser_grid_xyz", "sensor_grid_xyz"))
     for key, points in (("laser_grid_xyz", laser), ("sensor_grid_xyz", sensor)):
         if points.ndim not in (2, 3) or points.shape[-1] != 3 or points.size == 0:
@@ -118,11 +142,22 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     lasers, sensors, shape = laser.size // 3, sensor.size // 3, values.shape[1:]
     paired = kind in (T_SX_SY, T_SI)
     spots = int(np.prod(shape))
-    fits = spots in (lasers, sensors) and {lasers, sensors} <= {1, spots} if paired else spots == lasers * sensors
+    fits = (
+        spots in (lasers, sensors) and {lasers, sensors} <= {1, spots}
+        if paired
+        else spots == lasers * sensors
+    )
     if not fits or 0 in values.shape:
-        raise CaptureError(f"H in {name} has shape {values.shape}, which does not fit {lasers} laser and {sensors} sensor points")
+        raise CaptureError(
+            f"H in {name} has shape {values.shape}, which does not fit {lasers} laser and {sensors} sensor points"
+        )
     if kind in (T_SI, T_LI_SI):
-        return laser, sensor, (spots,) if paired else None, np.ascontiguousarray(values.reshape(len(values), -1).T)
+        return (
+            laser,
+            sensor,
+            (spots,) if paired else None,
+            np.ascontiguousarray(values.reshape(len(values), -1).T),
+        )
     if not paired:
         grids = [points.shape[:2] for points in (laser, sensor)]
         if any(points.ndim != 3 for points in (laser, sensor)) or shape != (*grids[0], *grids[1]):
@@ -132,7 +167,9 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     return laser, sensor, shape, np.ascontiguousarray(values.reshape(len(values), -1).T)
 
 
-def _pair(shape: tuple[int, ...] | None, laser: np.ndarray, sensor: np.ndarray, *normals: np.ndarray) -> list[np.ndarray]:
+def _pair(
+    shape: tuple[int, ...] | None, laser: np.ndarray, sensor: np.ndarray, *normals: np.ndarray
+) -> list[np.ndarray]:
     """Laser and sensor points and normals, ``[S, 3]`` each, one row a spot."""
     lasers, sensors = laser.size // 3, sensor.size // 3
     product = shape is None or len(shape) == 4
@@ -141,7 +178,11 @@ def _pair(shape: tuple[int, ...] | None, laser: np.ndarray, sensor: np.ndarray, 
         rows = points.reshape(-1, 3)
         if product:
             rows = np.repeat(rows, sensors, axis=0) if is_laser else np.tile(rows, (lasers, 1))
-        spread.append(rows if product or len(rows) == max(lasers, sensors) else np.repeat(rows, max(lasers, sensors), axis=0))
+        spread.append(
+            rows
+            if product or len(rows) == max(lasers, sensors)
+            else np.repeat(rows, max(lasers, sensors), axis=0)
+        )
     return spread
 
 
@@ -152,7 +193,9 @@ def _normals(contents: Contents, name: str, points: np.ndarray) -> np.ndarray:
         return np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     normals = contents.places(key)
     if normals.shape != points.shape:
-        raise CaptureError(f"{key} in {contents.path.name} is {normals.shape} where the points are {points.shape}")
+        raise CaptureError(
+            f"{key} in {contents.path.name} is {normals.shape} where the points are {points.shape}"
+        )
     return normals
 
 
@@ -172,12 +215,16 @@ def _without_raw_scale(
     path: Path, counts: np.ndarray, laser: np.ndarray | None, points: np.ndarray, normals: np.ndarray
 ) -> tuple[np.ndarray, str]:
     if laser is None:
-        raise CaptureError(f"{path.name} has tal's raw scale but no laser_xyz to take it off by; give raw_scale=false to keep it")
+        raise CaptureError(
+            f"{path.name} has tal's raw scale but no laser_xyz to take it off by; give raw_scale=false to keep it"
+        )
     way = laser - points
     distance = np.linalg.norm(way, axis=1)
     cosine = (way * normals).sum(axis=1)
     if not (cosine > 1e-6 * distance).all() or distance.min() == 0:
-        raise CaptureError(f"{path.name} has tal's raw scale, but its laser at {laser.tolist()} does not face every wall point")
+        raise CaptureError(
+            f"{path.name} has tal's raw scale, but its laser at {laser.tolist()} does not face every wall point"
+        )
     factor = np.pi * cosine / distance**3
     told = f"divided by tal's raw scale π·cosθ_l/d_l², {factor.min():.3g} to {factor.max():.3g} over the wall"
     return (counts / factor[:, None]).astype(np.float32), told

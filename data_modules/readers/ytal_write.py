@@ -12,12 +12,15 @@ import h5py
 import numpy as np
 
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 T_SX_SY, T_LX_LY_SX_SY, T_SI, T_LI_SI = 1, 2, 3, 4  # H_format
 N_3, X_Y_3 = 1, 2  # *_grid_format
 _OURS = "nlos_lit: "  # one line of YAML whose value is JSON, so that no YAML parser is needed to read it back
-_COUNT_TYPES = {np.dtype(kind).name for kind in (np.uint8, np.uint16, np.uint32, np.uint64, np.int8, np.int16, np.int32, np.int64)}
+_COUNT_TYPES = {
+    np.dtype(kind).name
+    for kind in (np.uint8, np.uint16, np.uint32, np.uint64, np.int8, np.int16, np.int32, np.int64)
+}
 _VALUE_TYPES = {"float16", "float32", "float64"}
 
 
@@ -36,8 +39,12 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
     if path.exists() and not overwrite:
         raise CaptureError(f"{path} exists already; give another name or overwrite=True")
     values = capture.counts.astype(np.float32)
-    if capture.counts.dtype.kind in "ui" and not np.array_equal(values.astype(np.float64), capture.counts.astype(np.float64)):
-        raise CaptureError("counts above 16777216 do not fit y-tal's float32; split the exposure or sum fewer bins")
+    if capture.counts.dtype.kind in "ui" and not np.array_equal(
+        values.astype(np.float64), capture.counts.astype(np.float64)
+    ):
+        raise CaptureError(
+            "counts above 16777216 do not fit y-tal's float32; split the exposure or sum fewer bins"
+        )
     kind, shape, laser, sensor = _layout(capture)
     items: dict[str, Any] = {
         "H": np.ascontiguousarray(values.T).reshape(capture.n_bins, *shape),
@@ -53,7 +60,9 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
         ("sensor", sensor, capture.sensor, capture.sensor_normal),
     ):
         place = capture.provenance.get(f"{name}_xyz")
-        items[f"{name}_xyz"] = h5py.Empty(np.float64) if place is None else np.asarray(place, dtype=np.float32)
+        items[f"{name}_xyz"] = (
+            h5py.Empty(np.float64) if place is None else np.asarray(place, dtype=np.float32)
+        )
         items[f"{name}_grid_xyz"] = points[rows]
         items[f"{name}_grid_normals"] = normals[rows]
         items[f"{name}_grid_format"] = np.array([X_Y_3 if rows.ndim == 2 else N_3], dtype=np.int32)
@@ -63,19 +72,33 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
 
 def own_facts(text: str, path: Path) -> dict[str, Any] | None:
     """The facts that `write_capture` put into ``scene_info``, as `Capture` arguments and ``dtype``; None for any other text."""
-    line = next((line for line in text.splitlines() if line.startswith(_OURS)), None) if _OURS in text else None
+    line = (
+        next((line for line in text.splitlines() if line.startswith(_OURS)), None) if _OURS in text else None
+    )
     if line is None:
         return None
-    broken = CaptureError(f"scene_info in {path.name} does not hold this project's facts as written; the file was altered")
+    broken = CaptureError(
+        f"scene_info in {path.name} does not hold this project's facts as written; the file was altered"
+    )
     try:
         facts = json.loads(line[len(_OURS) :])
-        facts = {key: facts[key] for key in ("dtype", "gate", "scan_shape", "scan_order", "exposure_s", "is_counts", "provenance")}
+        facts = {
+            key: facts[key]
+            for key in ("dtype", "gate", "scan_shape", "scan_order", "exposure_s", "is_counts", "provenance")
+        }
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise broken from error
-    whole = {"gate": facts["gate"], "scan_shape": facts["scan_shape"] or [], "scan_order": facts["scan_order"] or []}
+    whole = {
+        "gate": facts["gate"],
+        "scan_shape": facts["scan_shape"] or [],
+        "scan_order": facts["scan_order"] or [],
+    }
     if (
         facts["dtype"] not in _COUNT_TYPES | _VALUE_TYPES
-        or any(not isinstance(v, list) or any(type(n) is not int or not 0 <= n < 2**40 for n in v) for v in whole.values())
+        or any(
+            not isinstance(v, list) or any(type(n) is not int or not 0 <= n < 2**40 for n in v)
+            for v in whole.values()
+        )
         or len(facts["gate"]) != 2
         or type(facts["is_counts"]) is not bool
         or not isinstance(facts["provenance"], dict)
@@ -85,7 +108,9 @@ def own_facts(text: str, path: Path) -> dict[str, Any] | None:
         raise broken
     facts["gate"] = tuple(facts["gate"])
     facts["scan_shape"] = None if facts["scan_shape"] is None else tuple(facts["scan_shape"])
-    facts["scan_order"] = None if facts["scan_order"] is None else np.asarray(facts["scan_order"], dtype=np.int64)
+    facts["scan_order"] = (
+        None if facts["scan_order"] is None else np.asarray(facts["scan_order"], dtype=np.int64)
+    )
     return facts
 
 
@@ -122,7 +147,11 @@ def _layout(capture: Capture) -> tuple[int, tuple[int, ...], np.ndarray, np.ndar
     if one_laser != one_sensor:
         return T_SI, (capture.n_spots,), rows[:1] if one_laser else rows, rows if one_laser else rows[:1]
     run = int(np.argmax((capture.laser != capture.laser[0]).any(axis=1))) or capture.n_spots
-    if 1 < run < capture.n_spots and capture.n_spots % run == 0 and _is_product(capture, rows[::run], rows[:run]):
+    if (
+        1 < run < capture.n_spots
+        and capture.n_spots % run == 0
+        and _is_product(capture, rows[::run], rows[:run])
+    ):
         return T_LI_SI, (capture.n_spots // run, run), rows[::run], rows[:run]
     return T_SI, (capture.n_spots,), rows, rows
 
@@ -130,9 +159,9 @@ def _layout(capture: Capture) -> tuple[int, tuple[int, ...], np.ndarray, np.ndar
 def _is_product(capture: Capture, lasers: np.ndarray, sensors: np.ndarray) -> bool:
     """Whether the spots are every laser point with every sensor point, the sensor changing fastest."""
     slow, fast = (capture.laser, capture.laser_normal), (capture.sensor, capture.sensor_normal)
-    return all(np.array_equal(values, np.repeat(values[lasers], len(sensors), axis=0)) for values in slow) and all(
-        np.array_equal(values, np.tile(values[sensors], (len(lasers), 1))) for values in fast
-    )
+    return all(
+        np.array_equal(values, np.repeat(values[lasers], len(sensors), axis=0)) for values in slow
+    ) and all(np.array_equal(values, np.tile(values[sensors], (len(lasers), 1))) for values in fast)
 
 
 def _write(path: Path, items: dict[str, Any]) -> None:
@@ -144,7 +173,9 @@ def _write(path: Path, items: dict[str, Any]) -> None:
     try:
         with h5py.File(partial, "w") as file:
             for name, value in items.items():
-                packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if name == "H" else {}
+                packed = (
+                    {"compression": "gzip", "compression_opts": 4, "shuffle": True} if name == "H" else {}
+                )
                 file.create_dataset(name, data=value, **packed)
         os.chmod(partial, 0o644)
         os.replace(partial, path)

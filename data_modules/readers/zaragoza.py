@@ -11,7 +11,7 @@ from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.frame import device_distances, wall_rotation
 from data_modules.readers.options import ReaderOptions
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 NAME = "zaragoza"
 DESCRIPTION = (
@@ -34,7 +34,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     contents = open_contents(path)
     contents.require("data", "deltaT", "cameraGridPositions", "cameraPosition")
     if contents.ndim("data") not in (4, 5, 6, 7):
-        raise CaptureError(f"data in {path.name} must have 4 to 7 axes; found {contents.entries['data'].shape}")
+        raise CaptureError(
+            f"data in {path.name} must have 4 to 7 axes; found {contents.entries['data'].shape}"
+        )
     confocal = contents.ndim("data") < 6
     last = _coordinates_last(contents, confocal)
     camera = _grid(contents, "cameraGridPositions", last)
@@ -43,7 +45,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     if not confocal:
         laser = _grid(contents, "laserGridPositions", last)
         laser_normals = _grid(contents, "laserGridNormals", last) if "laserGridNormals" in contents else None
-    counts, colours, bounces = _transients(contents, camera.shape[:2], None if confocal else laser.shape[:2], last)
+    counts, colours, bounces = _transients(
+        contents, camera.shape[:2], None if confocal else laser.shape[:2], last
+    )
     toward = np.array([0.0, -1.0, 0.0])
     rotation = wall_rotation(toward if normals is None else normals)
     camera_at = contents.places("cameraPosition").ravel()
@@ -76,7 +80,11 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         t_start=(contents.scalar("t0") if "t0" in contents else 0.0) + offset * length,
         shape=shape,
         is_counts=False,
-        steps=[f"summed {bounces} bounces, {colours} colours", f"first and last way: {told}", "turned so that the wall faces +z"],
+        steps=[
+            f"summed {bounces} bounces, {colours} colours",
+            f"first and last way: {told}",
+            "turned so that the wall faces +z",
+        ],
     )
 
 
@@ -95,14 +103,18 @@ def _coordinates_last(contents: Contents, confocal: bool) -> bool:
         ):
             if points[2 if last else 0] == 3 and scanned == grid:
                 return last
-    raise CaptureError(f"data {data} in {contents.path.name} does not scan the grid of cameraGridPositions {points}")
+    raise CaptureError(
+        f"data {data} in {contents.path.name} does not scan the grid of cameraGridPositions {points}"
+    )
 
 
 def _grid(contents: Contents, name: str, last: bool) -> np.ndarray:
     """``[a, b, 3]`` in the order of the data's axes."""
     values = contents.places(name)
     if values.ndim != 3 or values.shape[2 if last else 0] != 3:
-        raise CaptureError(f"{name} in {contents.path.name} must be a grid of points; found shape {values.shape}")
+        raise CaptureError(
+            f"{name} in {contents.path.name} must be a grid of points; found shape {values.shape}"
+        )
     return values if last else np.moveaxis(values, 0, -1)
 
 

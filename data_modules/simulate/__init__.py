@@ -2,7 +2,7 @@
 
 from data_modules.simulate.capture import simulate_capture
 from data_modules.simulate.mesh import Mesh, join, load_mesh
-from data_modules.simulate.scan import ScanPlan, wall_grid
+from data_modules.simulate.plan import ScanPlan, wall_grid
 from data_modules.simulate.scenes import SCENES, bunny_two_albedo, default_scene, letters
 from data_modules.simulate.sensor import SensorModel
 from data_modules.simulate.transients import simulate_transients

@@ -8,12 +8,12 @@ import logging
 import numpy as np
 
 from data_modules.simulate.mesh import Mesh
-from data_modules.simulate.scan import ScanPlan, wall_grid
+from data_modules.simulate.plan import ScanPlan, wall_grid
 from data_modules.simulate.sensor import SensorModel, direct_pulse, draw_counts, respond
 from data_modules.simulate.transients import simulate_with_rest
 from data_modules.simulate.truth import Truth, view_from_wall
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 log = logging.getLogger(__name__)
 
@@ -70,11 +70,20 @@ def simulate_capture(
     inside = clean.sum() / fine.sum()
     end = scan.t_start + scan.n_bins * scan.bin_length
     if inside == 0:
-        raise UserError(f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; change the time window")
+        raise UserError(
+            f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; change the time window"
+        )
     if inside < 0.99:
-        log.warning("%.0f %% of the light arrives outside the window of %g … %g m of path", 100 * (1 - inside), scan.t_start, end)
+        log.warning(
+            "%.0f %% of the light arrives outside the window of %g … %g m of path",
+            100 * (1 - inside),
+            scan.t_start,
+            end,
+        )
     gain = sensor.mean_counts * len(laser) / clean.sum()
-    expected = to_bins(respond(gain * fine[:, 1:-1], sensor, scan.bin_length / oversample)) + sensor.background
+    expected = (
+        to_bins(respond(gain * fine[:, 1:-1], sensor, scan.bin_length / oversample)) + sensor.background
+    )
     gate = scan.gate
     if sensor.direct_counts:
         pulse = direct_pulse(sensor, scan.bin_length, scan.n_bins, scan.t_start)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -33,11 +33,15 @@ class Mesh:
         vertices = np.asarray(self.vertices, dtype=np.float64)
         faces = np.asarray(self.faces, dtype=np.int64)
         if any(a.ndim != 2 or a.shape[1] != 3 or len(a) == 0 for a in (vertices, faces)):
-            raise UserError(f"a mesh needs vertices [V, 3] and faces [F, 3]; found {vertices.shape} and {faces.shape}")
+            raise UserError(
+                f"a mesh needs vertices [V, 3] and faces [F, 3]; found {vertices.shape} and {faces.shape}"
+            )
         if not np.isfinite(vertices).all():
             raise UserError("the mesh has vertices that are NaN or infinite")
         if faces.min() < 0 or faces.max() >= len(vertices):
-            raise UserError(f"the mesh's faces name vertices {faces.min()} … {faces.max()} but there are {len(vertices)}")
+            raise UserError(
+                f"the mesh's faces name vertices {faces.min()} … {faces.max()} but there are {len(vertices)}"
+            )
         albedo = np.broadcast_to(np.asarray(self.albedo, dtype=np.float64), (len(vertices),))
         if not ((albedo >= 0) & (albedo <= 1)).all():
             raise UserError(f"albedo must lie in [0, 1]; found {albedo.min():g} … {albedo.max():g}")
@@ -81,7 +85,9 @@ def join(*meshes: Mesh) -> Mesh:
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
     return Mesh(
-        np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), np.concatenate([mesh.albedo for mesh in meshes])
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate(faces),
+        np.concatenate([mesh.albedo for mesh in meshes]),
     )
 
 
@@ -101,7 +107,9 @@ def load_mesh(path: str | Path, albedo: float = 1.0) -> Mesh:
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         read = o3d.io.read_triangle_mesh(str(path))
     if not read.has_triangles():
-        raise UserError(f"{path} holds no triangles that can be read; give an OBJ or PLY file of a triangle mesh")
+        raise UserError(
+            f"{path} holds no triangles that can be read; give an OBJ or PLY file of a triangle mesh"
+        )
     values = np.asarray(read.vertex_colors).mean(axis=1) if read.has_vertex_colors() else albedo
     return Mesh(np.asarray(read.vertices), np.asarray(read.triangles), values)
 
@@ -121,7 +129,9 @@ def subdivide(mesh: Mesh, longest_edge: Callable[[np.ndarray], np.ndarray]) -> M
     vertices, albedo, done = mesh.vertices, mesh.albedo, []
     while len(faces):
         corners = vertices[faces]
-        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)  # edge i joins corners i and i + 1
+        edges = np.linalg.norm(
+            corners - np.roll(corners, -1, axis=1), axis=2
+        )  # edge i joins corners i and i + 1
         longest = edges.argmax(axis=1)
         split = edges.max(axis=1) > longest_edge(corners.mean(axis=1))
         done.append(faces[~split])

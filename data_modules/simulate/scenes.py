@@ -18,7 +18,13 @@ READABLE = np.array([-1.0, 1.0])  # from (right, up) as seen from the wall to wo
 
 
 def plate(
-    centre: tuple[float, float, float], width: float, height: float, *, turn_x: float = 0, turn_y: float = 0, albedo: float = 1
+    centre: tuple[float, float, float],
+    width: float,
+    height: float,
+    *,
+    turn_x: float = 0,
+    turn_y: float = 0,
+    albedo: float = 1,
 ) -> Mesh:
     """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre: ``turn_x``, then ``turn_y``, rad."""
     x, y = width / 2, height / 2
@@ -26,17 +32,27 @@ def plate(
     cx, sx, cy, sy = np.cos(turn_x), np.sin(turn_x), np.cos(turn_y), np.sin(turn_y)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    return Mesh(corners @ (about_y @ about_x).T + np.asarray(centre), np.array([[0, 1, 2], [0, 2, 3]]), albedo)
+    return Mesh(
+        corners @ (about_y @ about_x).T + np.asarray(centre), np.array([[0, 1, 2], [0, 2, 3]]), albedo
+    )
 
 
 def sphere(
-    centre: tuple[float, float, float], radius: float, *, rings: int = 24, opening: float = np.pi, albedo: float = 1.0
+    centre: tuple[float, float, float],
+    radius: float,
+    *,
+    rings: int = 24,
+    opening: float = np.pi,
+    albedo: float = 1.0,
 ) -> Mesh:
     """A sphere of latitude rings about the pole nearest the wall, out to the polar angle ``opening`` (π/2: a dome)."""
     segments = 2 * rings
     polar = np.linspace(0, opening, rings + 1)[:, None]
     around = 2 * np.pi * np.arange(segments) / segments
-    unit = np.stack(np.broadcast_arrays(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), -np.cos(polar)), axis=2)
+    unit = np.stack(
+        np.broadcast_arrays(np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), -np.cos(polar)),
+        axis=2,
+    )
     i, j = (n.ravel() for n in np.meshgrid(np.arange(rings), np.arange(segments), indexing="ij"))
     a, b = i * segments + j, i * segments + (j + 1) % segments
     c, d = b + segments, a + segments
@@ -45,7 +61,13 @@ def sphere(
 
 
 def strokes(
-    lines: list[np.ndarray], *, depth: float, stroke: float, bevel: float = 0.0, cell: float = 0.01, albedo: float = 1.0
+    lines: list[np.ndarray],
+    *,
+    depth: float,
+    stroke: float,
+    bevel: float = 0.0,
+    cell: float = 0.01,
+    albedo: float = 1.0,
 ) -> Mesh:
     """A plate in the shape of drawn lines, its rim bent back from the wall.
 
@@ -70,7 +92,9 @@ def strokes(
             inside |= across & (np.abs(offset @ along) <= np.linalg.norm(end - start) / 2)
         inside |= (np.linalg.norm(centres[:, :, None] - line, axis=3) <= stroke / 2).any(axis=2)
     padded = np.pad(inside, 1)
-    rim = ~(padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1])  # grid corners that touch the outside
+    rim = ~(
+        padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1]
+    )  # grid corners that touch the outside
     corner = low + cell * np.stack(np.meshgrid(*(np.arange(n + 1) for n in shape), indexing="ij"), axis=2)
     vertices = np.concatenate([corner, (depth + bevel * rim)[..., None]], axis=2).reshape(-1, 3)
     i, j = np.nonzero(inside)
@@ -88,7 +112,9 @@ def default_scene() -> Mesh:
     z = 0.68 to 0.86 m; the F hides it from part of the wall.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
-    letter = strokes([line * READABLE for line in f], depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5)
+    letter = strokes(
+        [line * READABLE for line in f], depth=0.5, stroke=0.10, bevel=0.01, cell=0.01, albedo=0.5
+    )
     dome = sphere((-0.06, -0.20, 0.86), 0.18, rings=16, opening=np.pi / 2, albedo=0.9)
     return join(letter, dome)
 
@@ -110,7 +136,9 @@ def letters() -> Mesh:
 
 def sphere_before_plate() -> Mesh:
     """A sphere of 0.25 m radius partly in front of a plate turned by 20° about y."""
-    return join(sphere((-0.35, 0.2, 0.85), 0.25, rings=48), plate((0.35, -0.2, 1.3), 0.6, 0.6, turn_y=np.deg2rad(20)))
+    return join(
+        sphere((-0.35, 0.2, 0.85), 0.25, rings=48), plate((0.35, -0.2, 1.3), 0.6, 0.6, turn_y=np.deg2rad(20))
+    )
 
 
 def bunny_two_albedo(mesh_path: str | Path) -> Mesh:
@@ -121,4 +149,8 @@ def bunny_two_albedo(mesh_path: str | Path) -> Mesh:
     return Mesh.from_face_albedo(mesh.vertices, mesh.faces, np.where(height > middle, 1.0, 0.3))
 
 
-SCENES: dict[str, Callable[[], Mesh]] = {"default": default_scene, "letters": letters, "sphere_before_plate": sphere_before_plate}
+SCENES: dict[str, Callable[[], Mesh]] = {
+    "default": default_scene,
+    "letters": letters,
+    "sphere_before_plate": sphere_before_plate,
+}

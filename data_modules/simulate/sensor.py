@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import fftconvolve
 from scipy.special import erfcx, ndtr
 
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 GAUSS_REACH = 8.0  # σ on either side, 1e-15 of the energy beyond
 TAIL_REACH = 36.0  # lengths 1/κ of the exponential, 2e-16 beyond
@@ -39,7 +39,9 @@ class SensorModel:
     def __post_init__(self) -> None:
         finite = (self.sigma, self.background, self.mean_counts, self.direct_counts)
         if not (np.isfinite(finite).all() and min(finite) >= 0 and self.mean_counts > 0 and self.kappa > 0):
-            raise UserError(f"sigma, background and direct_counts must be >= 0, kappa and mean_counts > 0; found {self}")
+            raise UserError(
+                f"sigma, background and direct_counts must be >= 0, kappa and mean_counts > 0; found {self}"
+            )
 
     @property
     def reach(self) -> tuple[float, float]:
@@ -83,7 +85,9 @@ def respond(transients: np.ndarray, sensor: SensorModel, bin_length: float) -> n
     for start in range(0, len(transients), SPOT_BLOCK):
         block = slice(start, start + SPOT_BLOCK)
         full = fftconvolve(transients[block], kernel[None], axes=1)
-        seen[block] = np.maximum(full[:, -first : -first + transients.shape[1]], 0)  # the FFT leaves ±1e-17 where there is nothing
+        seen[block] = np.maximum(
+            full[:, -first : -first + transients.shape[1]], 0
+        )  # the FFT leaves ±1e-17 where there is nothing
     return seen
 
 

@@ -22,7 +22,7 @@ from rich.progress import track
 
 from data_modules.simulate.mesh import Mesh, subdivide
 from data_modules.simulate.visibility import Occluder
-from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
+from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +62,10 @@ class Patches:
         def longest_edge(centroids: np.ndarray) -> np.ndarray:
             nearest = np.linalg.norm(centroids - np.clip(centroids, low, high), axis=1)
             # Path length bends by e²/(4 d) over an edge e: keep that below a tenth of a bin.
-            return np.minimum(0.025 * nearest, np.sqrt(0.4 * bin_length * nearest)).clip(1e-4 * self.scale) / detail
+            return (
+                np.minimum(0.025 * nearest, np.sqrt(0.4 * bin_length * nearest)).clip(1e-4 * self.scale)
+                / detail
+            )
 
         self.scale = float(np.ptp(mesh.vertices, axis=0).max())
         self.mesh = split = subdivide(mesh, longest_edge)
@@ -73,14 +76,18 @@ class Patches:
         self.centroid = split.corners.mean(axis=1)
         self.albedo = split.albedo[split.faces].mean(axis=1)
         # Rays start off the surface by a little of the patch's own size, but by no less than single precision resolves.
-        lift = np.maximum(1e-3 * np.sqrt(self.area), 2e-6 * max(self.scale, float(np.abs(mesh.vertices).max())))
+        lift = np.maximum(
+            1e-3 * np.sqrt(self.area), 2e-6 * max(self.scale, float(np.abs(mesh.vertices).max()))
+        )
         offset = lift[:, None] * self.normal
         self.front, self.back = ((self.centroid + side * offset).astype(np.float32) for side in (1, -1))
 
     def __len__(self) -> int:
         return len(self.area)
 
-    def legs(self, points: np.ndarray, normals: np.ndarray, two_sided: bool, occlusion: bool) -> tuple[np.ndarray, np.ndarray]:
+    def legs(
+        self, points: np.ndarray, normals: np.ndarray, two_sided: bool, occlusion: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
         """One leg of the path: from wall points ``[U, 3]`` with normals ``[U, 3]`` to all patches.
 
         Returns:
@@ -93,7 +100,9 @@ class Patches:
         row, patch = np.nonzero((at_wall > 0) & ((at_patch != 0) if two_sided else (at_patch > 0)))
         product = at_wall[row, patch] * at_patch[row, patch]
         if occlusion:
-            clear = ~self.occluder.blocked(np.where((product > 0)[:, None], self.front[patch], self.back[patch]), points[row])
+            clear = ~self.occluder.blocked(
+                np.where((product > 0)[:, None], self.front[patch], self.back[patch]), points[row]
+            )
             row, patch, product = row[clear], patch[clear], product[clear]
         factor = np.zeros(at_wall.shape)
         factor[row, patch] = product / _squared_distance(points, self.centroid)[row, patch] ** 2
@@ -167,18 +176,30 @@ def simulate_with_rest(
     laser, sensor, laser_normal, sensor_normal = (
         np.asarray(a, dtype=np.float64) for a in (laser, sensor, laser_normal, sensor_normal)
     )
-    for name, value in {"sensor": sensor, "laser_normal": laser_normal, "sensor_normal": sensor_normal}.items():
+    for name, value in {
+        "sensor": sensor,
+        "laser_normal": laser_normal,
+        "sensor_normal": sensor_normal,
+    }.items():
         if laser.ndim != 2 or laser.shape[1] != 3 or value.shape != laser.shape:
             raise CaptureError(f"laser and {name} must both be [S, 3]; found {laser.shape} and {value.shape}")
     if not (bin_length > 0 and n_bins > 0 and detail > 0):
-        raise UserError(f"bin_length, n_bins and detail must be positive; found {bin_length}, {n_bins} and {detail}")
+        raise UserError(
+            f"bin_length, n_bins and detail must be positive; found {bin_length}, {n_bins} and {detail}"
+        )
     ends = np.concatenate([np.c_[laser, laser_normal], np.c_[sensor, sensor_normal]])
     points, rows = np.unique(ends, axis=0, return_inverse=True)
     laser_row, sensor_row = rows.reshape(2, -1)
     patches = Patches(mesh, points[:, :3], bin_length, detail)
     cost = _work(patches, len(laser), len(points), n_bins)
     _check_memory(cost)
-    log.info("simulating %d spots × %d patches, about %.0f s, %.1f GiB", len(laser), cost.patches, cost.seconds, cost.bytes / 2**30)
+    log.info(
+        "simulating %d spots × %d patches, about %.0f s, %.1f GiB",
+        len(laser),
+        cost.patches,
+        cost.seconds,
+        cost.bytes / 2**30,
+    )
 
     def legs(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return patches.legs(points[index, :3], points[index, 3:], two_sided, occlusion)
@@ -188,11 +209,15 @@ def simulate_with_rest(
     size = max(1, BLOCK_PAIRS // len(patches))
     starts = range(0, len(laser), size)
     histogram = np.empty((len(laser), n_bins + 2))
-    bar = track(starts, f"transients of {len(patches)} patches", disable=not progress or cost.seconds < LONG_SECONDS)
+    bar = track(
+        starts, f"transients of {len(patches)} patches", disable=not progress or cost.seconds < LONG_SECONDS
+    )
     for start in bar:
         block = slice(start, start + size)
         if table is None:
-            used, local = np.unique(np.concatenate([laser_row[block], sensor_row[block]]), return_inverse=True)
+            used, local = np.unique(
+                np.concatenate([laser_row[block], sensor_row[block]]), return_inverse=True
+            )
             factor, distance = legs(used)
             l, s = local.reshape(2, -1)
         else:
@@ -202,7 +227,9 @@ def simulate_with_rest(
         bins = (distance[l] + distance[s] - t_start) / bin_length
         histogram[block] = spread_triangles(energy, bins, patches.mesh.faces, n_bins)
     if not histogram.any():
-        raise UserError("no face of the mesh is turned towards the wall and visible from it; flip its faces or use two_sided")
+        raise UserError(
+            "no face of the mesh is turned towards the wall and visible from it; flip its faces or use two_sided"
+        )
     return histogram
 
 
@@ -249,10 +276,14 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
     return np.maximum(histogram, 0)  # rounding leaves -1e-17 of a neighbour here and there
 
 
-def work(mesh: Mesh, laser: np.ndarray, sensor: np.ndarray, *, bin_length: float, n_bins: int, detail: float = 1.0) -> Work:
+def work(
+    mesh: Mesh, laser: np.ndarray, sensor: np.ndarray, *, bin_length: float, n_bins: int, detail: float = 1.0
+) -> Work:
     """What `simulate_transients` of these arguments would cost."""
     points = np.concatenate([laser, sensor])
-    return _work(Patches(mesh, points, bin_length, detail), len(laser), len(np.unique(points, axis=0)), n_bins)
+    return _work(
+        Patches(mesh, points, bin_length, detail), len(laser), len(np.unique(points, axis=0)), n_bins
+    )
 
 
 def _work(patches: Patches, n_spots: int, n_points: int, n_bins: int) -> Work:

@@ -10,7 +10,7 @@ import numpy as np
 
 from data_modules.simulate.mesh import Mesh
 from data_modules.simulate.visibility import Occluder
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -54,9 +54,18 @@ def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool 
     unit = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     behind = unit[:, 2] > 0
     normal[hit] = np.where(behind[:, None], -unit, unit)
-    albedo[hit] = np.where(behind & (not two_sided), 0.0, (weights * mesh.albedo[mesh.faces[face]]).sum(axis=1))
+    albedo[hit] = np.where(
+        behind & (not two_sided), 0.0, (weights * mesh.albedo[mesh.faces[face]]).sum(axis=1)
+    )
     shape = (len(x), len(y))
-    return Truth(np.asarray(x), np.asarray(y), depth.reshape(shape), normal.reshape(*shape, 3), albedo.reshape(shape), mesh)
+    return Truth(
+        np.asarray(x),
+        np.asarray(y),
+        depth.reshape(shape),
+        normal.reshape(*shape, 3),
+        albedo.reshape(shape),
+        mesh,
+    )
 
 
 def save_truth(path: str | Path, truth: Truth) -> None:
@@ -92,7 +101,11 @@ def load_truth(path: str | Path) -> Truth:
         data["depth"][nothing] = np.nan
         data["normal"][nothing] = np.nan
         albedo = file["albedo"][()].astype(np.float64) if "albedo" in file else np.where(nothing, np.nan, 1.0)
-        mesh = Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo"))) if "mesh" in file else None
+        mesh = (
+            Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo")))
+            if "mesh" in file
+            else None
+        )
         truth = Truth(**data, albedo=albedo, mesh=mesh)
         extra = {name: file[name][()] for name in ("clean", "expected") if name in file}
         return replace(truth, **extra, gain=float(file["gain"][()]) if "gain" in file else None)

@@ -19,7 +19,9 @@ class Occluder:
 
         self._tensor = o3d.core.Tensor
         self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32)))
+        self._scene.add_triangles(
+            self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32))
+        )
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """``[N]`` True where something lies between ``start`` and ``end`` ``[N, 3]``; both should be clear of the surface."""
@@ -28,14 +30,18 @@ class Occluder:
         rays[:, 3:] = end - start
         return self._scene.test_occlusions(self._tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
-    def first_hit(self, start: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def first_hit(
+        self, start: np.ndarray, direction: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """First surface met from ``start`` along ``direction`` ``[N, 3]``.
 
         Returns:
             distance ``[N]`` in units of ``direction`` (infinite where nothing is met), face index ``[N]`` and barycentric
             weights ``[N, 3]`` of the face's corners (meaningless where nothing is met).
         """
-        hit = self._scene.cast_rays(self._tensor(np.concatenate([start, direction], axis=1).astype(np.float32)))
+        hit = self._scene.cast_rays(
+            self._tensor(np.concatenate([start, direction], axis=1).astype(np.float32))
+        )
         uv = hit["primitive_uvs"].numpy().astype(np.float64)
         weights = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)
         return hit["t_hit"].numpy(), hit["primitive_ids"].numpy().astype(np.int64), weights

@@ -18,11 +18,20 @@ from nlos_lit.baselines.light_cone import lct, lct_bytes
 from nlos_lit.baselines.migration import fk, fk_bytes
 from nlos_lit.baselines.rsd import rsd, rsd_bytes
 from nlos_lit.capture import Capture
-from nlos_lit.errors import MemoryBudgetError, UserError
-from nlos_lit.grid import VolumeGrid
+from nlos_lit.capture.errors import MemoryBudgetError, UserError
+from nlos_lit.capture.volume_grid import VolumeGrid
 
-METHODS: dict[str, Callable[..., torch.Tensor]] = {"bp": bp, "fbp": fbp, "lct": lct, "dlct": dlct, "fk": fk, "rsd": rsd}
-FIELDS: dict[str, Callable[..., torch.Tensor]] = {"dlct": dlct_field}  # methods that find the surface's direction as well
+METHODS: dict[str, Callable[..., torch.Tensor]] = {
+    "bp": bp,
+    "fbp": fbp,
+    "lct": lct,
+    "dlct": dlct,
+    "fk": fk,
+    "rsd": rsd,
+}
+FIELDS: dict[str, Callable[..., torch.Tensor]] = {
+    "dlct": dlct_field
+}  # methods that find the surface's direction as well
 _BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {
     "bp": bp_bytes,
     "fbp": fbp_bytes,

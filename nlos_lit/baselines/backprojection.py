@@ -14,9 +14,8 @@ import torch.nn.functional as F
 
 from nlos_lit.baselines.scan import gated_transients
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.scan import path_range
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
 _BLOCK = 1 << 19  # (spot, voxel) pairs at a time: they bound the memory, and few calls are made
 _SCRATCH = 64 << 20  # bytes that the allocator and the libraries were seen to keep besides
@@ -56,7 +55,11 @@ def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Ten
         paths = [torch.empty_like(square) for square in squares]
         for k, z in enumerate(grid.z):
             for end, square, path in zip(ends, squares, paths, strict=True):
-                torch.add(square, _squared_distances(end.points[:, 2:], np.array([[z]]), end.passes * scale), out=path).sqrt_()
+                torch.add(
+                    square,
+                    _squared_distances(end.points[:, 2:], np.array([[z]]), end.passes * scale),
+                    out=path,
+                ).sqrt_()
             paths[0] += shift
             for s in range(0, capture.n_spots, spots):
                 chunk = slice(s, min(s + spots, capture.n_spots))
@@ -64,12 +67,16 @@ def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Ten
                 where[:, 0, :, 0] = paths[0][ends[0].of_spot[chunk]]
                 if len(ends) > 1:
                     where[:, 0, :, 0] += paths[1][ends[1].of_spot[chunk]]
-                found = F.grid_sample(transients[chunk, None, None], where, padding_mode="zeros", align_corners=False)
+                found = F.grid_sample(
+                    transients[chunk, None, None], where, padding_mode="zeros", align_corners=False
+                )
                 volume[k, block] += found.view(-1, width).sum(0)
     return volume.view(nz, nx, ny)
 
 
-def fbp(capture: Capture, grid: VolumeGrid, *, filter: str = "log", sigma: float = 1.0, falloff: float = 0.0) -> torch.Tensor:
+def fbp(
+    capture: Capture, grid: VolumeGrid, *, filter: str = "log", sigma: float = 1.0, falloff: float = 0.0
+) -> torch.Tensor:
     """Filtered backprojection: ``max(0, -σ²·L I)`` of the backprojection ``I``.
 
     Args:
@@ -109,7 +116,9 @@ def bp_bytes(capture: Capture, grid: VolumeGrid) -> int:
     columns = _block_columns(grid, ends)
     pairs = max(1, min(_BLOCK // columns, capture.n_spots)) * columns
     transients = capture.n_spots * (capture.gate[1] - capture.gate[0])
-    return _SCRATCH + 4 * (transients + grid.n_voxels + 5 * pairs + 3 * sum(len(end.points) for end in ends) * columns)
+    return _SCRATCH + 4 * (
+        transients + grid.n_voxels + 5 * pairs + 3 * sum(len(end.points) for end in ends) * columns
+    )
 
 
 def fbp_bytes(capture: Capture, grid: VolumeGrid) -> int:
@@ -130,7 +139,9 @@ def _path_ends(capture: Capture) -> list[_PathEnd]:
     ends = []
     for points in (capture.sensor,) if capture.confocal else (capture.laser, capture.sensor):
         distinct, of_spot = np.unique(points, axis=0, return_inverse=True)
-        ends.append(_PathEnd(distinct, torch.from_numpy(of_spot.reshape(-1)), 2.0 if capture.confocal else 1.0))
+        ends.append(
+            _PathEnd(distinct, torch.from_numpy(of_spot.reshape(-1)), 2.0 if capture.confocal else 1.0)
+        )
     return ends
 
 

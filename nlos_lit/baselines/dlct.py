@@ -20,11 +20,19 @@ from collections.abc import Iterator
 
 import torch
 
-from nlos_lit.baselines.light_cone import Cone, cone_bytes, cone_kernel, cone_to_depth, lateral_weights, light_cone, padded
+from nlos_lit.baselines.light_cone import (
+    Cone,
+    cone_bytes,
+    cone_kernel,
+    cone_to_depth,
+    lateral_weights,
+    light_cone,
+    padded,
+)
 from nlos_lit.baselines.resample import apply_weights
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
-from nlos_lit.grid import VolumeGrid
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import VolumeGrid
 
 
 def dlct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:
@@ -79,7 +87,9 @@ def _channels(cone: Cone, depth: float, snr: float) -> Iterator[torch.Tensor]:
     size = padded(shape)
     kernel = cone_kernel(shape, size, pitch, cone.step)
     # The kernel's negative offsets lie at the far end of its axes.
-    along_x, along_y = (torch.fft.fftfreq(size[axis + 1], 1 / size[axis + 1]) * pitch[axis] / depth for axis in (0, 1))
+    along_x, along_y = (
+        torch.fft.fftfreq(size[axis + 1], 1 / size[axis + 1]) * pitch[axis] / depth for axis in (0, 1)
+    )
     lever = (along_x[:, None], along_y[None, :], torch.ones(1, 1))
     power, total = 0.0, torch.zeros(())
     for arm in lever:

@@ -19,9 +19,9 @@ from scipy.fft import next_fast_len
 from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.scan import Lattice, path_range
+from nlos_lit.capture.aperture import Lattice
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
 
 def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:
@@ -77,7 +77,9 @@ def light_cone(capture: Capture, grid: VolumeGrid, method: str, falloff: float) 
 
 def lateral_weights(lattice: Lattice, grid: VolumeGrid) -> tuple[torch.Tensor, torch.Tensor]:
     """Matrices that resample from the scan's lattice to the grid, along x and along y."""
-    axes = zip(lattice.origin[:2], lattice.pitch, lattice.shape, (grid.x, grid.y), grid.pitch[:2], strict=True)
+    axes = zip(
+        lattice.origin[:2], lattice.pitch, lattice.shape, (grid.x, grid.y), grid.pitch[:2], strict=True
+    )
     along_x, along_y = (linear_weights(*axis) for axis in axes)
     return along_x, along_y
 
@@ -112,19 +114,29 @@ def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
     return cone_bytes(capture, grid, "lct", padded_arrays=4, volumes=1, matrices=1)
 
 
-def cone_bytes(capture: Capture, grid: VolumeGrid, method: str, *, padded_arrays: int, volumes: int, matrices: int) -> int:
+def cone_bytes(
+    capture: Capture, grid: VolumeGrid, method: str, *, padded_arrays: int, volumes: int, matrices: int
+) -> int:
     """Bytes of a light-cone method: three copies of the transients, and at once so many arrays of the transform's size, volumes,
     and matrices from the cone to depths; ``method`` is named in messages."""
     bins = gated_bins(capture, grid)
     m, nx, ny = padded((bins, *confocal_lattice(capture, method).shape))
     transform, resampling = m * nx * (ny + 2), bins * grid.shape[0]
-    return 4 * (3 * bins * capture.n_spots + padded_arrays * transform + volumes * grid.n_voxels + matrices * resampling)
+    return 4 * (
+        3 * bins * capture.n_spots
+        + padded_arrays * transform
+        + volumes * grid.n_voxels
+        + matrices * resampling
+    )
 
 
 def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
     """How many bins of the gate :func:`lct` and f-k migration work on: those that light from the volume can reach."""
     longest = path_range(capture, grid)[1]
-    return min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1) - capture.gate[0]
+    return (
+        min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1)
+        - capture.gate[0]
+    )
 
 
 def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -132,7 +144,9 @@ def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(next_fast_len(2 * n, real=True) for n in shape)
 
 
-def cone_kernel(shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float) -> torch.Tensor:
+def cone_kernel(
+    shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float
+) -> torch.Tensor:
     """``δ(x² + y² - w)`` on the lattice: at each lateral offset one lattice cell's area, shared by the two nearest ``w``."""
     bins, nx, ny = shape
     x, y = np.meshgrid(np.arange(1 - nx, nx), np.arange(1 - ny, ny), indexing="ij")
@@ -155,7 +169,9 @@ def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tenso
     row = np.clip(((middle - edges[0]) / step).astype(int), 0, bins - 1)
     value = length / np.diff(edges)[column] * middle ** (falloff / 2) / step
     index = torch.from_numpy(np.stack([row, column]))
-    return torch.sparse_coo_tensor(index, torch.from_numpy(value).float(), (bins, bins), check_invariants=True)
+    return torch.sparse_coo_tensor(
+        index, torch.from_numpy(value).float(), (bins, bins), check_invariants=True
+    )
 
 
 def cone_to_depth(cone: Cone, depth: np.ndarray, width: float, power: int = 1) -> torch.Tensor:

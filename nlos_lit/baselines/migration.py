@@ -17,8 +17,7 @@ from nlos_lit.baselines.light_cone import gated_bins
 from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.scan import path_range
+from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
 _SCRATCH = 24 << 20  # bytes that the allocator and the libraries were seen to keep besides
 
@@ -46,7 +45,10 @@ def fk(capture: Capture, grid: VolumeGrid, *, falloff: float = 4.0) -> torch.Ten
     power = torch.view_as_real(image).square().sum(-1)
     del image
     along_x, along_y = (
-        linear_weights(lattice.origin[a], lattice.pitch[a], lattice.shape[a], (grid.x, grid.y)[a], grid.pitch[a]) for a in (0, 1)
+        linear_weights(
+            lattice.origin[a], lattice.pitch[a], lattice.shape[a], (grid.x, grid.y)[a], grid.pitch[a]
+        )
+        for a in (0, 1)
     )
     along_z = linear_weights(start / 2 + step / 2, step, bins, grid.z - lattice.origin[2], grid.pitch[2])
     return apply_weights(power, along_z, along_x, along_y)
@@ -112,7 +114,13 @@ def fk_bytes(capture: Capture, grid: VolumeGrid) -> int:
     wide = 8 * half * px * py
     native = bins * capture.n_spots
     moving = max(2 * wide, 112 * block)
-    return _SCRATCH + wide + moving + 16 * size * capture.n_spots + 4 * (2 * native + grid.n_voxels + bins * grid.shape[0])
+    return (
+        _SCRATCH
+        + wide
+        + moving
+        + 16 * size * capture.n_spots
+        + 4 * (2 * native + grid.n_voxels + bins * grid.shape[0])
+    )
 
 
 def _cubic_weights(t: torch.Tensor) -> tuple[torch.Tensor, ...]:

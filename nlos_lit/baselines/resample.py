@@ -29,7 +29,9 @@ def linear_weights(start: float, pitch: float, count: int, centres: np.ndarray, 
     return torch.from_numpy(weights).float()
 
 
-def apply_weights(volume: torch.Tensor, along_z: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor) -> torch.Tensor:
+def apply_weights(
+    volume: torch.Tensor, along_z: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
+) -> torch.Tensor:
     """``[mz, mx, my]`` volume to ``[nz, nx, ny]`` by one matrix ``[n, m]`` per axis; identities are skipped."""
     volume = torch.tensordot(along_z, volume, dims=1)
     if not _identity(along_x):

@@ -7,10 +7,10 @@ import math
 import torch
 
 from nlos_lit.capture import Capture
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.parameters import BoundedParameter
-from nlos_lit.phasor import PhasorImaging
-from nlos_lit.scan import spot_spacing
+from nlos_lit.capture.aperture import spot_spacing
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.model.parameters import BoundedParameter
+from nlos_lit.model.phasor import PhasorImaging
 
 
 def rsd(

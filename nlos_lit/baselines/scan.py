@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
-from nlos_lit.scan import Lattice, find_lattice
+from nlos_lit.capture.aperture import Lattice, find_lattice
+from nlos_lit.capture.errors import CaptureError
 
 
 def confocal_lattice(capture: Capture, method: str) -> Lattice:

@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from nlos_lit.export import Points
-from nlos_lit.grid import VolumeGrid
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.io.points import Points
 
-STEEPEST = 4.0  # change of depth from one column to the next, in columns, above which they are not one surface
+STEEPEST = (
+    4.0  # change of depth from one column to the next, in columns, above which they are not one surface
+)
 
 
 def front_points(
-    volume: np.ndarray, grid: VolumeGrid, threshold: float, field: np.ndarray | None = None, smooth: float = 1.0
+    volume: np.ndarray,
+    grid: VolumeGrid,
+    threshold: float,
+    field: np.ndarray | None = None,
+    smooth: float = 1.0,
 ) -> Points:
     """One point a column whose maximum reaches ``threshold`` of the volume's.
 
@@ -52,13 +58,17 @@ def _vertex(volume: np.ndarray, best: np.ndarray) -> np.ndarray:
     if last < 2:
         return np.zeros(best.shape)
     inner = np.clip(best, 1, last - 1)
-    low, middle, high = (np.take_along_axis(volume, (inner + step)[None], 0)[0].astype(np.float64) for step in (-1, 0, 1))
+    low, middle, high = (
+        np.take_along_axis(volume, (inner + step)[None], 0)[0].astype(np.float64) for step in (-1, 0, 1)
+    )
     curvature = low - 2 * middle + high
     curved = (curvature < 0) & (inner == best)
     return np.where(curved, np.clip((low - high) / (2 * np.where(curved, curvature, 1)), -0.5, 0.5), 0.0)
 
 
-def _normals_of_depth(depth: np.ndarray, seen: np.ndarray, pitch: tuple[float, float, float], smooth: float) -> np.ndarray:
+def _normals_of_depth(
+    depth: np.ndarray, seen: np.ndarray, pitch: tuple[float, float, float], smooth: float
+) -> np.ndarray:
     """``[3, nx, ny]`` (∂z/∂x, ∂z/∂y, -1) of the smoothed depths of seen columns; towards the wall where a column stands alone."""
     weight = gaussian_filter(seen.astype(np.float64), smooth) if smooth else seen.astype(np.float64)
     blurred = gaussian_filter(np.where(seen, depth, 0), smooth) if smooth else np.where(seen, depth, 0)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.afterpulsing import Afterpulsing
 from nlos_lit.effects.ambient_map import AmbientMap
 from nlos_lit.effects.background_slope import BackgroundSlope
-from nlos_lit.effects.base import Effect, Extension
 from nlos_lit.effects.clock_scale import ClockScale
 from nlos_lit.effects.direct_leak import DirectLeak
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.gate_edges import GateEdges
 from nlos_lit.effects.ghost_pulse import GhostPulse
 from nlos_lit.effects.higher_order_bounces import HigherOrderBounces
@@ -20,7 +23,6 @@ from nlos_lit.effects.occlusion import Occlusion
 from nlos_lit.effects.pile_up import PileUp
 from nlos_lit.effects.power_drift import PowerDrift
 from nlos_lit.effects.retroreflection import Retroreflection
-from nlos_lit.effects.scan import Scan
 from nlos_lit.effects.specular_lobe import SpecularLobe
 from nlos_lit.effects.tcspc_nonlinearity import TcspcNonlinearity
 from nlos_lit.effects.time_drift import TimeDrift
@@ -29,9 +31,8 @@ from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.vignetting import Vignetting
 from nlos_lit.effects.wall_reflectance import WallReflectance
 from nlos_lit.effects.wall_tilt import WallTilt
-from nlos_lit.errors import UserError
 
-__all__ = ["EFFECTS", "Effect", "Extension", "Scan", "build_effects"]
+__all__ = ["EFFECTS", "Effect", "Extension", "build_effects"]
 
 EFFECTS: tuple[type[Effect], ...] = (
     # path

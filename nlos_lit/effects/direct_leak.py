@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.delays import geometric
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.functional.delays import geometric
 
 
 class DirectLeak(Effect):
@@ -34,10 +34,21 @@ class DirectLeak(Effect):
         most = 1e3 * (scan.mean_counts / scan.n_bins + scan.background)
         return (
             Parameter("amplitude", "counts/bin", 0.0, scan.background, 0.0, most),
-            Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins * 2, grid=geometric(3 * bins, bins * width, 8), log=True),
+            Parameter(
+                "decay",
+                "m",
+                None,
+                0.2,
+                bins,
+                bins * scan.n_bins * 2,
+                grid=geometric(3 * bins, bins * width, 8),
+                log=True,
+            ),
         )
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate
         since = (torch.arange(last, dtype=background.dtype, device=background.device) - first).clamp_min(0)
-        return background + self.value("amplitude") * torch.exp(-since * self.scan.bin_length / self.value("decay"))
+        return background + self.value("amplitude") * torch.exp(
+            -since * self.scan.bin_length / self.value("decay")
+        )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
 
 
 class GateEdges(Effect):
@@ -37,6 +37,8 @@ class GateEdges(Effect):
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
-        opening, closing = (torch.exp(-k.clamp_min(0) / self.value("width")) for k in (bins - first, last - 1 - bins))
+        opening, closing = (
+            torch.exp(-k.clamp_min(0) / self.value("width")) for k in (bins - first, last - 1 - bins)
+        )
         sensitivity = (1 - self.value("start") * opening) * (1 - self.value("end") * closing)
         return expected * torch.where(bins >= first, sensitivity, 1.0)

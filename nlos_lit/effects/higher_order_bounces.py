@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter, Quantity
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter, Quantity
 from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_paths import Paths, SplineSplat
 
@@ -74,7 +74,9 @@ class HigherOrderBounces(Effect):
         member, cell = clusters(paths.centre.detach())
         power = energy.sum(2)
         laser, laser_leg = throughput(self.laser[spots], paths)
-        sensor, sensor_leg = (laser, laser_leg) if self.scan.confocal else throughput(self.sensor[spots], paths)
+        sensor, sensor_leg = (
+            (laser, laser_leg) if self.scan.confocal else throughput(self.sensor[spots], paths)
+        )
         into, out = power / sensor, power / laser
         inward, outward = into @ member, out @ member
         first = (into * laser_leg) @ member / (inward + 1e-12)
@@ -83,7 +85,9 @@ class HigherOrderBounces(Effect):
         light = inward[:, :, None] * exchange * outward[:, None, :] / math.pi
         length = first[:, :, None] + gap + last[:, None, :]
         scan = self.scan
-        arrivals = SplineSplat.apply(light.flatten(1), (length.flatten(1) - scan.t_start) / scan.bin_length, n_bins)
+        arrivals = SplineSplat.apply(
+            light.flatten(1), (length.flatten(1) - scan.t_start) / scan.bin_length, n_bins
+        )
         return blurred(arrivals, cell / scan.bin_length)
 
 

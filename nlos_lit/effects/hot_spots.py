@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter, Quantity
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter, Quantity
 
 HOT = 0.25  # of the hottest spot: from there on a spot counts as hot
 
@@ -32,7 +32,9 @@ class HotSpots(Effect):
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         typical = scan.mean_counts / scan.n_bins + scan.background
-        return (Parameter("extra", "counts/bin", 0.0, scan.background, 0.0, 1e3 * typical, size=scan.n_spots),)
+        return (
+            Parameter("extra", "counts/bin", 0.0, scan.background, 0.0, 1e3 * typical, size=scan.n_spots),
+        )
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         return background + self.value("extra").reshape(-1)[spots][:, None]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -35,7 +35,9 @@ class LaserSensorBaseline(Effect):
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         reach = 0.25 * scan.half
-        return tuple(Parameter(name, "m", 0.0, scan.bin_length, -reach, reach) for name in ("baseline_x", "baseline_y"))
+        return tuple(
+            Parameter(name, "m", 0.0, scan.bin_length, -reach, reach) for name in ("baseline_x", "baseline_y")
+        )
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         stated, real = self.legs(paths, spots)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
 from nlos_lit.functional.surfel_paths import Paths
 
 EDGE = 0.12  # width of the soft edge, in radii
@@ -46,8 +46,12 @@ class Occlusion(Effect):
         radius = 0.3 * half
         return (
             Parameter("opacity", "1", 0.0, 0.2, 0.0, 1.0),
-            Parameter("x", "m", None, 0.1 * half, x - 2 * half, x + 2 * half, grid=tuple(x + a for a in across)),
-            Parameter("y", "m", None, 0.1 * half, y - 2 * half, y + 2 * half, grid=tuple(y + a for a in across)),
+            Parameter(
+                "x", "m", None, 0.1 * half, x - 2 * half, x + 2 * half, grid=tuple(x + a for a in across)
+            ),
+            Parameter(
+                "y", "m", None, 0.1 * half, y - 2 * half, y + 2 * half, grid=tuple(y + a for a in across)
+            ),
             Parameter("z", "m", None, 0.2, nearest / 10, farthest, grid=(nearest / 2,), log=True),
             Parameter("radius", "m", None, 0.2, radius / 20, 2 * half, grid=(radius,), log=True),
         )
@@ -61,7 +65,14 @@ class Occlusion(Effect):
         """``[B, M]`` of the lines from ``wall`` ``[B, 3]`` to ``centre`` ``[M, 3]``."""
         z, radius = self.value("z"), self.value("radius")
         away = centre - wall[:, None]
-        crossing = wall[:, None, :2] + away[..., :2] * ((z - wall[:, 2, None]) / away[..., 2].clamp_min(1e-3))[..., None]
-        off = torch.sqrt((crossing[..., 0] - self.value("x")) ** 2 + (crossing[..., 1] - self.value("y")) ** 2 + 1e-12)
+        crossing = (
+            wall[:, None, :2]
+            + away[..., :2] * ((z - wall[:, 2, None]) / away[..., 2].clamp_min(1e-3))[..., None]
+        )
+        off = torch.sqrt(
+            (crossing[..., 0] - self.value("x")) ** 2 + (crossing[..., 1] - self.value("y")) ** 2 + 1e-12
+        )
         width = EDGE * radius
-        return 1 - self.value("opacity") * torch.sigmoid((radius - off) / width) * torch.sigmoid((centre[:, 2] - z) / width)
+        return 1 - self.value("opacity") * torch.sigmoid((radius - off) / width) * torch.sigmoid(
+            (centre[:, 2] - z) / width
+        )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -40,4 +40,6 @@ class Retroreflection(Effect):
         # Grazing surfels carry no light; the clamp keeps a power below 0 finite for them.
         cosines = (paths.laser_cosine * paths.sensor_cosine).clamp_min(1e-6)
         exponent = (4 - self.value("falloff")) / 2
-        return contribution * torch.exp(exponent * torch.log(distance) + (self.value("cosine") - 1) * torch.log(cosines))
+        return contribution * torch.exp(
+            exponent * torch.log(distance) + (self.value("cosine") - 1) * torch.log(cosines)
+        )

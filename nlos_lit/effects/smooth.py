@@ -7,9 +7,9 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter, Quantity
-from nlos_lit.effects.basis import smooth_basis, smooth_map_basis
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis
 
 
 class SmoothEffect(Effect):
@@ -38,7 +38,9 @@ class SmoothEffect(Effect):
         raise NotImplementedError
 
     @classmethod
-    def coefficient(cls, scan: Scan, unit: str, scale: float, bound: float, likely: float) -> tuple[Parameter]:
+    def coefficient(
+        cls, scan: Scan, unit: str, scale: float, bound: float, likely: float
+    ) -> tuple[Parameter]:
         """The declaration: null 0, bounds ± ``bound``, ``likely`` deviation of the first coefficient."""
         share = cls.basis(scan)[1]
         prior = tuple((likely * share**1.5).tolist())
@@ -51,7 +53,9 @@ class SmoothEffect(Effect):
 
     def quantities(self) -> dict[str, Quantity]:
         unit, field = self.declared[self.coefficients].unit, self.field()
-        reported = {"rms": Quantity(length(field / len(field) ** 0.5, self.declared[self.coefficients].scale), unit)}
+        reported = {
+            "rms": Quantity(length(field / len(field) ** 0.5, self.declared[self.coefficients].scale), unit)
+        }
         if self.ends:
             reported["peak_to_peak"] = Quantity(field.amax() - field.amin(), unit)
         return reported

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter
 from nlos_lit.functional.surfel_paths import Paths
 
 

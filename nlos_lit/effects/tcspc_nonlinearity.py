@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter, Quantity
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter, Quantity
 from nlos_lit.effects.smooth import length
 
 MOST_PERIODS = 200
@@ -46,8 +46,13 @@ class TcspcNonlinearity(Effect):
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
         phase = 2 * math.pi * bins / self.value("period")
-        return expected * (1 + self.value("sine") * torch.sin(phase) + self.value("cosine") * torch.cos(phase))
+        return expected * (
+            1 + self.value("sine") * torch.sin(phase) + self.value("cosine") * torch.cos(phase)
+        )
 
     def quantities(self) -> dict[str, Quantity]:
         waves = torch.stack([self.value("sine"), self.value("cosine")])
-        return {"amplitude": Quantity(length(waves, 0.02), "1"), "period": Quantity(self.value("period"), "bins")}
+        return {
+            "amplitude": Quantity(length(waves, 0.02), "1"),
+            "period": Quantity(self.value("period"), "bins"),
+        }

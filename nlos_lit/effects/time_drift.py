@@ -6,8 +6,8 @@ from typing import ClassVar
 
 from torch import Tensor
 
-from nlos_lit.effects.base import Parameter
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_time
 from nlos_lit.functional.surfel_paths import Paths
 
@@ -38,7 +38,9 @@ class TimeDrift(SmoothEffect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return cls.coefficient(scan, "m", scan.bin_length, 0.1 * scan.n_bins * scan.bin_length, 4 * scan.bin_length)
+        return cls.coefficient(
+            scan, "m", scan.bin_length, 0.1 * scan.n_bins * scan.bin_length, 4 * scan.bin_length
+        )
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.field(spots)[:, None, None]

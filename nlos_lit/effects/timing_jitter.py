@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from nlos_lit.effects.base import Effect, Parameter, Quantity
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect, Parameter, Quantity
 from nlos_lit.effects.smooth import length as euclidean
 from nlos_lit.functional.surfel_paths import Paths
 

@@ -20,7 +20,9 @@ def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
     left = 0.5 * torch.exp(-0.5 * scaled**2)
     root = math.sqrt(0.5)
     # Clamps keep the branch that is not taken finite, for the gradient's sake.
-    jitter = torch.where(scaled < 0, left * torch.special.erfcx(-scaled.clamp_max(0) * root), torch.special.ndtr(scaled))
+    jitter = torch.where(
+        scaled < 0, left * torch.special.erfcx(-scaled.clamp_max(0) * root), torch.special.ndtr(scaled)
+    )
     decay = torch.exp((0.5 * (kappa * sigma) ** 2 - kappa * time).clamp_max(0)) * torch.special.ndtr(late)
     delayed = torch.where(late < 0, left * torch.special.erfcx(-late.clamp_max(0) * root), decay)
     return (jitter - delayed).clamp(0.0, 1.0)

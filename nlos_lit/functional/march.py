@@ -95,7 +95,9 @@ def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
     """:func:`trilinear` without gradients; of points in single precision by a fused, faster kernel good to 1e-5 voxels."""
     if points.dtype == torch.float64:
         parts, flat = points.split(_ROWS) if points.device.type == "cpu" else (points,), volume.reshape(-1)
-        return torch.cat([(flat[index] * weight).sum(1) for index, weight in (corner_weights(p, lattice) for p in parts)])
+        return torch.cat(
+            [(flat[index] * weight).sum(1) for index, weight in (corner_weights(p, lattice) for p in parts)]
+        )
     scale, shift = unit_scale(lattice)
     return sample_unit(volume, ((points - lattice.origin) * scale + shift)[:, [1, 0, 2]])
 
@@ -124,7 +126,9 @@ def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
         unit = torch.cat([unit, unit[:1].expand(missing, 3)])
     field = volume[None, None].expand(batches, 1, *volume.shape)
     grid = unit.view(batches, 1, 1, -1, 3)
-    return torch.nn.functional.grid_sample(field, grid, align_corners=True, padding_mode="border").reshape(-1)[:count]
+    return torch.nn.functional.grid_sample(field, grid, align_corners=True, padding_mode="border").reshape(
+        -1
+    )[:count]
 
 
 def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
@@ -202,14 +206,22 @@ def march(
     peak = torch.zeros(origins.shape[0] * n * n, device=device)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for pair, line in _candidates(cells, extent, lattice.origin, origins, frames, n, chunk):
-        promising = torch.nonzero(highest.index_select(0, pair % len(bricks)) >= peak.index_select(0, line)).squeeze(1)
+        promising = torch.nonzero(
+            highest.index_select(0, pair % len(bricks)) >= peak.index_select(0, line)
+        ).squeeze(1)
         pair, line = pair.index_select(0, promising), line.index_select(0, promising)
         near, far = _clip(boxes.index_select(0, pair), inverse.index_select(0, line))
         first = torch.ceil(near / step - 0.5).clamp_min_(0)
         count = (torch.ceil(far / step - 0.5) - first).clamp_min_(0)
         meets = torch.nonzero(count).squeeze(1)
-        first, count, line = first.index_select(0, meets), count.index_select(0, meets).long(), line.index_select(0, meets)
-        chords = torch.cat([unit_origin[line // (n * n)], unit_world.index_select(0, line), first[:, None]], dim=1)
+        first, count, line = (
+            first.index_select(0, meets),
+            count.index_select(0, meets).long(),
+            line.index_select(0, meets),
+        )
+        chords = torch.cat(
+            [unit_origin[line // (n * n)], unit_world.index_select(0, line), first[:, None]], dim=1
+        )
         for part in _split_by_total(count, chunk):
             owner, rank = expand(count[part])
             chord = chords[part].index_select(0, owner)
@@ -229,12 +241,16 @@ def march(
     line, distance = line[near_peak], distance[near_peak]
     hits, hit = torch.unique(line, return_inverse=True)
     if fine > 1:
-        best = torch.zeros(len(hits), device=device).scatter_reduce(0, hit, distance, "amin", include_self=False)
+        best = torch.zeros(len(hits), device=device).scatter_reduce(
+            0, hit, distance, "amin", include_self=False
+        )
         offsets = torch.arange(-fine, fine + 1, device=device) * (step / fine)
         distance = (best[:, None] + offsets).reshape(-1)
         hit = torch.arange(len(hits), device=device).repeat_interleave(len(offsets))
         direction = torch.einsum("sij,sj->si", frames[hits // (n * n)], rays[hits % (n * n)])
-        position = (origins[hits // (n * n)][hit] + distance[:, None] * direction[hit] - lattice.origin) / lattice.pitch
+        position = (
+            origins[hits // (n * n)][hit] + distance[:, None] * direction[hit] - lattice.origin
+        ) / lattice.pitch
         # Outside the volume there is no intensity, so no surface either; the largest sample stays whatever the rounding.
         inside = ((position >= 0) & (position <= last)).all(1) | (offsets == 0).repeat(len(hits))
         distance, hit = distance[inside], hit[inside]

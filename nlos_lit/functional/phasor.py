@@ -15,7 +15,17 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from nlos_lit.functional.even import EvenAxis, Rotation, even_transform, fold, inverse, mirror, polar, runs, unfold
+from nlos_lit.functional.even_convolution import (
+    EvenAxis,
+    Rotation,
+    even_transform,
+    fold,
+    inverse,
+    mirror,
+    polar,
+    runs,
+    unfold,
+)
 
 ROWS = 1 << 15  # of the field that are converted at once on a CPU
 RUN = 64  # rows that are summed in single precision
@@ -34,7 +44,9 @@ def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
     return torch.complex(kernel.real @ real, kernel.imag @ real)
 
 
-def frequencies(omega_bounds: tuple[float, float], sigma_min: float, period: float, cutoff: float = 3.0) -> Tensor:
+def frequencies(
+    omega_bounds: tuple[float, float], sigma_min: float, period: float, cutoff: float = 3.0
+) -> Tensor:
     """``[F]`` rad/m, float64: multiples of 2π/period that carry the spectrum of every admissible virtual pulse.
 
     Frequencies at and below zero are left out, although a pulse of few cycles has weight there. Against Eq. 2, which has
@@ -52,12 +64,16 @@ def frequencies(omega_bounds: tuple[float, float], sigma_min: float, period: flo
     return step * torch.arange(first, last + 1, dtype=torch.float64)
 
 
-def weight_basis(omega: Tensor, omega_bounds: tuple[float, float], sigma_bounds: tuple[float, float], tolerance: float) -> Tensor:
+def weight_basis(
+    omega: Tensor, omega_bounds: tuple[float, float], sigma_bounds: tuple[float, float], tolerance: float
+) -> Tensor:
     """Orthonormal ``[F, R]`` whose span holds every admissible spectrum within ``tolerance`` (relative, 2-norm).
 
     The family is sampled densely against its own width (a fifth of 1/σ in Ω), so what lies between the samples is in the span too.
     """
-    sigmas = torch.exp(torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 24, dtype=torch.float64))
+    sigmas = torch.exp(
+        torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 24, dtype=torch.float64)
+    )
     family = []
     for sigma in sigmas:
         count = 3 + int((omega_bounds[1] - omega_bounds[0]) * float(sigma) * 5)
@@ -133,7 +149,10 @@ def lattice_phasors(
     ys = voxel_origin[1] + pitch[1] * torch.arange(shape[1], dtype=torch.float64, device=device)
     for z in depth.tolist():
         kernel = Rotation(torch.sqrt(lateral + z * z), step, n_freq, 1)
-        to_fixed = [torch.sqrt((xs[:, None] - p[0]) ** 2 + (ys - p[1]) ** 2 + (z - p[2]) ** 2) for p in fixed.to(device)]
+        to_fixed = [
+            torch.sqrt((xs[:, None] - p[0]) ** 2 + (ys - p[1]) ** 2 + (z - p[2]) ** 2)
+            for p in fixed.to(device)
+        ]
         legs = [Rotation(distance, step, n_freq, 1) for distance in to_fixed]
         mixed = torch.zeros(rank, shape[0] * shape[1] * 2, device=device)
         for part in runs(n_freq, x.length * y.length, device):
@@ -150,7 +169,13 @@ def _voxels_first(plane: Tensor) -> Tensor:
 
 
 def direct_phasors(
-    field: Tensor, omega: Tensor, basis: Tensor, laser: Tensor, sensor: Tensor, voxels: Tensor, block: int = 256
+    field: Tensor,
+    omega: Tensor,
+    basis: Tensor,
+    laser: Tensor,
+    sensor: Tensor,
+    voxels: Tensor,
+    block: int = 256,
 ) -> Iterator[Tensor]:
     """The same sum for any wall and any spots, voxel block after voxel block.
 
@@ -207,7 +232,9 @@ class PhasorMagnitude(torch.autograd.Function):
         if field.dtype == weights.dtype:
             parts = (rows @ weights).view(voxels, 2)
         else:
-            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(ROWS)]).view(voxels, 2)
+            parts = torch.cat([chunk.to(weights.dtype) @ weights for chunk in rows.split(ROWS)]).view(
+                voxels, 2
+            )
         magnitude = torch.linalg.vector_norm(parts, dim=1)
         ctx.save_for_backward(field, parts, magnitude)
         return magnitude
@@ -224,7 +251,9 @@ class PhasorMagnitude(torch.autograd.Function):
             return None, sum(sum_of_rows(part, chunk.to(part.dtype)) for part, chunk in pairs)
         touched = torch.nonzero((grad != 0) & (magnitude > 0)).squeeze(1)
         result = torch.zeros(field.shape[2], dtype=torch.float64)
-        for chunk in touched.split(ROWS):  # collecting these rows takes most of the time, so they may as well be doubled
+        for chunk in touched.split(
+            ROWS
+        ):  # collecting these rows takes most of the time, so they may as well be doubled
             pull = parts[chunk] * (grad[chunk] / magnitude[chunk])[:, None]
             result += pull.reshape(-1).double() @ field[chunk].double().reshape(-1, len(result))
         return None, result

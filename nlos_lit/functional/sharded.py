@@ -9,7 +9,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,9 @@ class Slabs:
         """
         running = dist.get_world_size() if dist.is_available() and dist.is_initialized() else 1
         if running != ranks:
-            raise UserError(f"the phasor field was divided among {ranks} processes, {running} are running; start as many")
+            raise UserError(
+                f"the phasor field was divided among {ranks} processes, {running} are running; start as many"
+            )
         return cls(planes, ranks, dist.get_rank(), dist.new_group())
 
     def slab(self, rank: int) -> slice:
@@ -101,7 +103,9 @@ def leave_buffers(module: nn.Module) -> None:
 
     They never change once they are made, and a slab is its process's own.
     """
-    DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(module, [name for name, _ in module.named_buffers()])
+    DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(
+        module, [name for name, _ in module.named_buffers()]
+    )
 
 
 def _length(part: slice) -> int:
@@ -110,4 +114,8 @@ def _length(part: slice) -> int:
 
 def _filled(part: Tensor, planes: int) -> Tensor:
     """``part`` with planes of zeros at its end."""
-    return part if len(part) == planes else torch.cat([part, part.new_zeros(planes - len(part), *part.shape[1:])])
+    return (
+        part
+        if len(part) == planes
+        else torch.cat([part, part.new_zeros(planes - len(part), *part.shape[1:])])
+    )

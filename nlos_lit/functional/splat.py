@@ -9,7 +9,13 @@ from torch import Tensor
 
 
 def gaussian_splat(
-    contribution: Tensor, time: Tensor, spot: Tensor, n_spots: int, n_bins: int, sigma: float, normalise: bool = True
+    contribution: Tensor,
+    time: Tensor,
+    spot: Tensor,
+    n_spots: int,
+    n_bins: int,
+    sigma: float,
+    normalise: bool = True,
 ) -> Tensor:
     """Scatter paths into ``[n_spots, n_bins]`` transients with the Gaussian of Sec. 4.3.
 
@@ -34,7 +40,9 @@ def gaussian_splat(
     inside = (bins >= 0) & (bins < n_bins)
     index = (spot[:, None] * n_bins + bins).clamp(0, n_spots * n_bins - 1)
     flat = torch.zeros(n_spots * n_bins, dtype=values.dtype, device=values.device)
-    flat = flat.index_add(0, index.reshape(-1), torch.where(inside, values, torch.zeros_like(values)).reshape(-1))
+    flat = flat.index_add(
+        0, index.reshape(-1), torch.where(inside, values, torch.zeros_like(values)).reshape(-1)
+    )
     return flat.view(n_spots, n_bins)
 
 

@@ -41,7 +41,9 @@ class FieldFile:
         for begin in range(0, voxels, self.rows):
             part = buffer[: min(self.rows, voxels - begin)]
             if self.file.readinto(part) != part.nbytes:
-                raise OSError("the file of the phasor field is shorter than what was written; is the disk full?")
+                raise OSError(
+                    "the file of the phasor field is shorter than what was written; is the disk full?"
+                )
             yield slice(begin, begin + len(part)), torch.from_numpy(part).to(self.device)
 
 

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 
-def neighbour_pairs(centre: Tensor, normal: Tensor, reach: float, agree: float = 0.3, chunk: int = 1024) -> tuple[Tensor, Tensor]:
+def neighbour_pairs(
+    centre: Tensor, normal: Tensor, reach: float, agree: float = 0.3, chunk: int = 1024
+) -> tuple[Tensor, Tensor]:
     """Directed pairs (i, j) of surfels closer than ``reach`` to each other whose normals' cosine exceeds ``agree``.
 
     Args:
@@ -26,7 +28,12 @@ def neighbour_pairs(centre: Tensor, normal: Tensor, reach: float, agree: float =
 
 
 def bending(
-    centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor], crease: float = 0.5, stiffness: float = 0.05
+    centre: Tensor,
+    normal: Tensor,
+    weight: Tensor,
+    pairs: tuple[Tensor, Tensor],
+    crease: float = 0.5,
+    stiffness: float = 0.05,
 ) -> Tensor:
     """How badly neighbours fit one surface: ``Σ w r²/(1 + r²/c²)`` over pairs (Geman-McClure: an edge costs no more than c²).
 
@@ -52,7 +59,14 @@ def front_sheet(index: Tensor, depth: Tensor, limits: tuple[int, int]) -> Tensor
 
 
 def clear_view(
-    sheet: Tensor, origin: Tensor, pitch: Tensor, wall: Tensor, target: Tensor, samples: int, skip: float, chunk: int = 1 << 22
+    sheet: Tensor,
+    origin: Tensor,
+    pitch: Tensor,
+    wall: Tensor,
+    target: Tensor,
+    samples: int,
+    skip: float,
+    chunk: int = 1 << 22,
 ) -> Tensor:
     """``[W, V]`` True where the straight line from a wall point to a target does not pierce the front sheet.
 
@@ -71,8 +85,12 @@ def clear_view(
     for part in wall.split(max(1, chunk // (len(target) * samples))):
         d = target[None] - part[:, None]
         far = (1 - share) * torch.linalg.vector_norm(d, dim=2, keepdim=True) > skip * pitch.abs().max()
-        i = ((part[:, None, None, 0] + share * d[..., :1] - origin[0]) / pitch[0]).round().clamp(-1, nx).long() + 1
-        j = ((part[:, None, None, 1] + share * d[..., 1:2] - origin[1]) / pitch[1]).round().clamp(-1, ny).long() + 1
+        i = ((part[:, None, None, 0] + share * d[..., :1] - origin[0]) / pitch[0]).round().clamp(
+            -1, nx
+        ).long() + 1
+        j = ((part[:, None, None, 1] + share * d[..., 1:2] - origin[1]) / pitch[1]).round().clamp(
+            -1, ny
+        ).long() + 1
         height = flat[i * (ny + 2) + j]
         behind = part[:, None, None, 2] + share * d[..., 2:] > height
         solid = torch.isfinite(height)

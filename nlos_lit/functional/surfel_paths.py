@@ -90,14 +90,18 @@ def trace(
     return Paths(share * factor * other, leg + other_leg, *legs, centre, normal, area)
 
 
-def _leg(points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _leg(
+    points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
     """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]`` to the points."""
     dx, dy, dz = (p - wall[:, k, None, None] for k, p in enumerate(points))
     square = dx * dx + dy * dy + dz * dz
     n = normal[:, :, None, None]
     at_wall = (n[:, 0] * dx + n[:, 1] * dy + n[:, 2] * dz).clamp_min(0)
     # The points of one surfel lie in one plane, whose distance from the wall point is the same for all of them.
-    plane = -(facing[:, 0, None] * dx[..., :1] + facing[:, 1, None] * dy[..., :1] + facing[:, 2, None] * dz[..., :1]).clamp_max(0)
+    plane = -(
+        facing[:, 0, None] * dx[..., :1] + facing[:, 1, None] * dy[..., :1] + facing[:, 2, None] * dz[..., :1]
+    ).clamp_max(0)
     distance = torch.sqrt(square)
     return at_wall * plane / square**2, distance, plane / distance
 
@@ -114,7 +118,9 @@ def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
     first = torch.floor(time.detach() - 0.5)
     f = time - 0.5 - first
     g = 1 - f
-    weights = torch.stack([g**3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (3 * g**3 - 6 * g**2 + 4) / 6, f**3 / 6], dim=-1)
+    weights = torch.stack(
+        [g**3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (3 * g**3 - 6 * g**2 + 4) / 6, f**3 / 6], dim=-1
+    )
     return first.long() - 1, weights
 
 

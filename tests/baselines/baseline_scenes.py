@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from nlos_lit.capture import Capture
-from nlos_lit.grid import VolumeGrid
+from nlos_lit.capture.volume_grid import VolumeGrid
 
 
 def lattice(nx: int, ny: int, dx: float, dy: float, centre: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
@@ -50,7 +50,18 @@ def capture_of(
 ) -> Capture:
     counts = transients(laser, sensor, points, bins, bin_length, t_start, power).astype(np.float32)
     normals = np.tile([0.0, 0.0, 1.0], (len(laser), 1))
-    return Capture(counts, laser, sensor, normals, normals, bin_length, t_start, gate=gate, scan_shape=scan_shape, is_counts=False)
+    return Capture(
+        counts,
+        laser,
+        sensor,
+        normals,
+        normals,
+        bin_length,
+        t_start,
+        gate=gate,
+        scan_shape=scan_shape,
+        is_counts=False,
+    )
 
 
 def box(x: tuple[float, float, int], y: tuple[float, float, int], z: tuple[float, float, int]) -> VolumeGrid:

@@ -9,7 +9,9 @@ from tal.enums import CameraSystem
 capture, out = sys.argv[1:3]
 wavelength, cycles, first, step = (float(v) for v in sys.argv[3:7])
 data = tal.io.read_capture(capture)
-volume = tal.reconstruct.get_volume_project_rw(data, depths=[first + step * k for k in range(int(sys.argv[7]))])
+volume = tal.reconstruct.get_volume_project_rw(
+    data, depths=[first + step * k for k in range(int(sys.argv[7]))]
+)
 phasor = tal.reconstruct.pf.solve(
     data, c_wavelength=wavelength, wave_cycles=cycles, camera_system=CameraSystem.DIRECT_LIGHT, volume=volume
 )

@@ -15,10 +15,12 @@ from nlos_lit.baselines import bp, fbp, fk, lct
 from nlos_lit.baselines.light_cone import wiener_cone
 from nlos_lit.baselines.migration import stolt
 from nlos_lit.capture import Capture
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 
-def noisy_capture(laser: np.ndarray, sensor: np.ndarray, bins: int, t_start: float, gate: tuple[int, int]) -> Capture:
+def noisy_capture(
+    laser: np.ndarray, sensor: np.ndarray, bins: int, t_start: float, gate: tuple[int, int]
+) -> Capture:
     counts = np.random.default_rng(5).poisson(3.0, (len(laser), bins)).astype(np.uint16)
     normals = np.tile([0.0, 0.0, 1.0], (len(laser), 1))
     return Capture(counts, laser, sensor, normals, normals, 0.02, t_start, gate=gate)
@@ -79,7 +81,9 @@ def dense_wiener(cone: np.ndarray, pitch: tuple[float, float], step: float, snr:
     """Least squares with the kernel written out as a matrix on the padded, circular domain."""
     size = [next_fast_len(2 * n, real=True) for n in cone.shape]
     kernel = np.zeros(size)
-    for i, j in itertools.product(range(-cone.shape[1] + 1, cone.shape[1]), range(-cone.shape[2] + 1, cone.shape[2])):
+    for i, j in itertools.product(
+        range(-cone.shape[1] + 1, cone.shape[1]), range(-cone.shape[2] + 1, cone.shape[2])
+    ):
         w = ((i * pitch[0]) ** 2 + (j * pitch[1]) ** 2) / step
         for cell in range(cone.shape[0]):
             kernel[cell, i, j] = max(0.0, 1 - abs(w - cell)) * pitch[0] * pitch[1]
@@ -138,9 +142,16 @@ def test_lct_is_the_light_cone_transform(falloff, t_start):
     for start in np.linspace(z0, z1, 5):
         moved = type(grid)((grid.origin[0], grid.origin[1], start), grid.pitch, grid.shape)
         u = v_first + step * (np.arange(10) + 0.5)
-        expected = np.stack([[[2 * z * np.interp(z * z, u, solved[:, i, j]) for j in range(3)] for i in range(4)] for z in moved.z])
+        expected = np.stack(
+            [
+                [[2 * z * np.interp(z * z, u, solved[:, i, j]) for j in range(3)] for i in range(4)]
+                for z in moved.z
+            ]
+        )
         expected = np.maximum(expected, 0)
-        np.testing.assert_allclose(lct(capture, moved, falloff=falloff).numpy(), expected, atol=2e-3 * solved.max())
+        np.testing.assert_allclose(
+            lct(capture, moved, falloff=falloff).numpy(), expected, atol=2e-3 * solved.max()
+        )
 
 
 def literal_migration(field: np.ndarray, pitch: tuple[float, float], step: float, first: float) -> np.ndarray:

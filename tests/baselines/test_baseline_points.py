@@ -93,7 +93,11 @@ def test_falloff_is_compensated(method, power, falloff):
     grid = box((-0.2, 0.25, 16), (-0.3, 0.15, 16), (0.3, 0.9, 61))
     wall = lattice(32, 32, 0.03, 0.03)
     peaks = [
-        float(reconstruct(capture_of(wall, wall, [p], 256, 0.01, power=power), grid, method, falloff=falloff).max())
+        float(
+            reconstruct(
+                capture_of(wall, wall, [p], 256, 0.01, power=power), grid, method, falloff=falloff
+            ).max()
+        )
         for p in (near, far)
     ]
     # a falloff wrong by one power of z² would change the ratio by 4
@@ -103,7 +107,9 @@ def test_falloff_is_compensated(method, power, falloff):
 @pytest.mark.parametrize("method", sorted(METHODS))
 def test_bins_outside_the_gate_do_not_count(method):
     decoy = (-0.1, 0.1, 0.4)
-    reach = 2 if method == "rsd" else 1  # |u|² of a 14 cm pulse peaks 1.6 cm early: it falls steeply with depth so near the wall
+    reach = (
+        2 if method == "rsd" else 1
+    )  # |u|² of a 14 cm pulse peaks 1.6 cm early: it falls steeply with depth so near the wall
     both = capture_of(WALL, WALL, [POINT, decoy], 256, 0.01, gate=(100, 256))
     assert off_by(reconstruct(both.with_gate(first=0), GRID, method, **FLAT[method]), GRID, decoy) <= reach
     direct = both.counts.copy()

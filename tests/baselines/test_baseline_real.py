@@ -11,7 +11,7 @@ from conftest import real_file
 
 from nlos_lit.baselines import reconstruct
 from nlos_lit.capture import SPEED_OF_LIGHT, Capture
-from nlos_lit.grid import VolumeGrid
+from nlos_lit.capture.volume_grid import VolumeGrid
 
 
 def rendered(name: str) -> Capture:
@@ -26,7 +26,9 @@ def rendered(name: str) -> Capture:
         laser = np.broadcast_to(laser, sensor.shape)
     normals = np.tile([0.0, 0.0, 1.0], (len(sensor), 1))
     flat = np.ascontiguousarray(counts.reshape(len(counts), -1).T)
-    return Capture(flat, laser, sensor, normals, normals, bin_length, t_start, scan_shape=shape, is_counts=False)
+    return Capture(
+        flat, laser, sensor, normals, normals, bin_length, t_start, scan_shape=shape, is_counts=False
+    )
 
 
 def depth_errors(volume, grid: VolumeGrid, threshold: float) -> tuple[np.ndarray, float, float]:
@@ -38,10 +40,16 @@ def depth_errors(volume, grid: VolumeGrid, threshold: float) -> tuple[np.ndarray
     front = volume.max(0)
     seen = (front.values > threshold * volume.max()).numpy()
     errors = np.abs(grid.z[front.indices.numpy()] - truth)[seen & (truth > 0)] / grid.pitch[2]
-    return errors, float((seen & (truth > 0)).sum() / (truth > 0).sum()), float((seen & (truth < 0)).sum() / seen.sum())
+    return (
+        errors,
+        float((seen & (truth > 0)).sum() / (truth > 0).sum()),
+        float((seen & (truth < 0)).sum() / seen.sum()),
+    )
 
 
-@pytest.mark.parametrize(("method", "threshold", "false_share"), [("lct", 0.4, 0.35), ("fk", 0.4, 0.25), ("fbp", 0.4, 0.35)])
+@pytest.mark.parametrize(
+    ("method", "threshold", "false_share"), [("lct", 0.4, 0.35), ("fk", 0.4, 0.25), ("fbp", 0.4, 0.35)]
+)
 def test_letter_z_confocal(method, threshold, false_share):
     grid = box((-0.484375, 0.484375, 32), (-0.484375, 0.484375, 32), (0.35, 0.75, 51))
     volume = reconstruct(rendered("z_confocal_64_d3"), grid, method)
@@ -97,7 +105,10 @@ def test_su_is_legible(method):
         "U": [(-0.1, 0.1), (-0.1, 0.25), (0.25, 0.0), (-0.1, -0.25)],
     }
     for letter in ("S", "U"):
-        dimmest, brightest = min(stroke(letter, *p) for p in on[letter]), max(stroke(letter, *p) for p in off[letter])
+        dimmest, brightest = (
+            min(stroke(letter, *p) for p in on[letter]),
+            max(stroke(letter, *p) for p in off[letter]),
+        )
         assert dimmest > 1.25 * brightest
 
 
@@ -113,6 +124,9 @@ def test_figure_4_is_legible():
         i, j = np.abs(grid.x - x).argmin(), np.abs(grid.y - y).argmin()
         return float(front[i - 1 : i + 2, j - 1 : j + 2].mean())
 
-    strokes = [near(x, y) for x, y in ((0.42, 0.18), (0.42, 0.05), (0.26, -0.02), (0.1, 0.2), (0.1, 0.0), (0.1, -0.2))]
+    strokes = [
+        near(x, y)
+        for x, y in ((0.42, 0.18), (0.42, 0.05), (0.26, -0.02), (0.1, 0.2), (0.1, 0.0), (0.1, -0.2))
+    ]
     gaps = [near(x, y) for x, y in ((0.26, 0.25), (0.34, -0.3), (-0.15, 0.1), (-0.15, -0.3))]
     assert min(strokes) > 1.25 * max(gaps)

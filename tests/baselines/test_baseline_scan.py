@@ -12,8 +12,9 @@ from baseline_scenes import box, capture_of, lattice
 from nlos_lit.baselines import METHODS, estimate_bytes, reconstruct
 from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import gated_transients
-from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
-from nlos_lit.scan import find_lattice, path_range
+from nlos_lit.capture.aperture import find_lattice
+from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError
+from nlos_lit.capture.volume_grid import path_range
 
 WALL = lattice(6, 5, 0.1, 0.12, centre=(0.03, -0.2))
 GRID = box((-0.2, 0.2, 7), (-0.3, 0.1, 6), (0.3, 0.7, 9))
@@ -60,7 +61,10 @@ def test_no_lattice_is_said_clearly(method, name, reason):
     points = bad_points(name)
     capture = capture_of(points, points, [POINT], 128, 0.02)
     title = {"lct": "lct", "fk": "f-k"}[method]
-    with pytest.raises(CaptureError, match=f"{title} needs a confocal scan on a regular planar grid; this capture is .*{reason}"):
+    with pytest.raises(
+        CaptureError,
+        match=f"{title} needs a confocal scan on a regular planar grid; this capture is .*{reason}",
+    ):
         reconstruct(capture, GRID, method)
     assert reconstruct(capture, GRID, "bp").shape == GRID.shape
 
@@ -69,7 +73,9 @@ def test_no_lattice_is_said_clearly(method, name, reason):
 def test_not_confocal_is_said_clearly(method):
     capture = capture_of(np.tile(WALL[:1], (30, 1)), WALL, [POINT], 128, 0.02)
     for function in (reconstruct, estimate_bytes):
-        with pytest.raises(CaptureError, match="needs a confocal scan on a regular planar grid; this capture is single_laser"):
+        with pytest.raises(
+            CaptureError, match="needs a confocal scan on a regular planar grid; this capture is single_laser"
+        ):
             function(capture, GRID, method)
 
 
@@ -78,7 +84,9 @@ def test_path_range_bounds_every_path():
     shortest, longest = path_range(capture, GRID)
     x, y, z = np.meshgrid(GRID.x, GRID.y, GRID.z, indexing="ij")
     voxels = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
-    paths = sum(np.linalg.norm(voxels[:, None] - points[None], axis=2) for points in (capture.laser, capture.sensor))
+    paths = sum(
+        np.linalg.norm(voxels[:, None] - points[None], axis=2) for points in (capture.laser, capture.sensor)
+    )
     assert shortest <= paths.min()
     assert longest >= paths.max()
     assert shortest > 0.6
@@ -124,7 +132,7 @@ def test_budget_is_checked_before_work(method, monkeypatch):
 
     for module in ("backprojection", "light_cone", "migration"):
         monkeypatch.setattr(f"nlos_lit.baselines.{module}.gated_transients", forbidden)
-    monkeypatch.setattr("nlos_lit.phasor.PhasorImaging.prepare", forbidden)
+    monkeypatch.setattr("nlos_lit.model.phasor.PhasorImaging.prepare", forbidden)
     with pytest.raises(MemoryBudgetError, match=f"method {method} needs .* GiB, above the budget of"):
         reconstruct(capture, GRID, method, budget_bytes=need - 1)
 
@@ -144,7 +152,16 @@ def test_estimates_follow_the_size():
 def test_linear_weights_by_hand():
     centres = np.array([-0.6, -0.4, 0.0, 0.25, 1.5, 2.0, 2.45, 2.6])
     found = linear_weights(0.0, 1.0, 3, centres, 0.5)
-    expected = [[0, 0, 0], [1, 0, 0], [1, 0, 0], [0.75, 0.25, 0], [0, 0.5, 0.5], [0, 0, 1], [0, 0, 1], [0, 0, 0]]
+    expected = [
+        [0, 0, 0],
+        [1, 0, 0],
+        [1, 0, 0],
+        [0.75, 0.25, 0],
+        [0, 0.5, 0.5],
+        [0, 0, 1],
+        [0, 0, 1],
+        [0, 0, 0],
+    ]
     np.testing.assert_allclose(found.numpy(), expected, atol=1e-6)
 
 

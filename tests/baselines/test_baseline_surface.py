@@ -13,12 +13,18 @@ GRID = box((-0.3, 0.3, 7), (0.1, 0.5, 5), (0.5, 0.9, 41))  # pitches 0.1, 0.1, 0
 
 def test_depth_is_the_vertex_of_a_parabola():
     volume = np.zeros(GRID.shape)
-    volume[20:23, 3, 2] = [0.5, 1.0, 0.75]  # vertex at 1/6: (0.5 - 0.75)/(2 (0.5 - 2 + 0.75)) planes past plane 21
+    volume[20:23, 3, 2] = [
+        0.5,
+        1.0,
+        0.75,
+    ]  # vertex at 1/6: (0.5 - 0.75)/(2 (0.5 - 2 + 0.75)) planes past plane 21
     volume[10:13, 5, 1] = [0.0, 0.4, 0.0]
     volume[0, 0, 0] = 0.3  # below the threshold
     volume[40, 6, 4] = 0.9  # at the last plane: no vertex
     points = front_points(volume, GRID, 0.35)
-    assert points.positions == pytest.approx(np.array([[0.0, 0.3, 0.71 + 0.01 / 6], [0.2, 0.2, 0.61], [0.3, 0.5, 0.9]]))
+    assert points.positions == pytest.approx(
+        np.array([[0.0, 0.3, 0.71 + 0.01 / 6], [0.2, 0.2, 0.61], [0.3, 0.5, 0.9]])
+    )
     assert points.albedo == pytest.approx([1.0, 0.4, 0.9])
     assert points.normals == pytest.approx(np.tile([0.0, 0.0, -1.0], (3, 1)))  # single columns face the wall
 
@@ -40,7 +46,9 @@ def test_normals_of_a_sloping_sheet(smooth):
 
 def test_a_step_between_two_surfaces_is_no_slope():
     x, _ = np.meshgrid(GRID.x, GRID.y, indexing="ij")
-    steep = front_points(sheet(np.where(x > -0.05, 0.9, 0.5)), GRID, 0.2, smooth=0.0)  # 0.4 m over a column of 0.1 m
+    steep = front_points(
+        sheet(np.where(x > -0.05, 0.9, 0.5)), GRID, 0.2, smooth=0.0
+    )  # 0.4 m over a column of 0.1 m
     assert steep.normals == pytest.approx(np.tile([0.0, 0.0, -1.0], (len(steep), 1)), abs=1e-6)
 
 

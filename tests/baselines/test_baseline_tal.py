@@ -17,8 +17,8 @@ from conftest import ROOT, real_file
 from data_modules.readers import read_capture, write_capture
 from nlos_lit.baselines import reconstruct
 from nlos_lit.capture import Capture
-from nlos_lit.grid import VolumeGrid
-from nlos_lit.scan import find_lattice
+from nlos_lit.capture.aperture import find_lattice
+from nlos_lit.capture.volume_grid import VolumeGrid
 
 WAVELENGTH, CYCLES, FIRST, STEP, PLANES = 0.125, 4.0, 0.35, 0.008, 51
 
@@ -37,14 +37,21 @@ def captured(name: str) -> Capture:
     keep = np.arange(side * side).reshape(side, side)[:: side // 32, :: side // 32].ravel()
     fields = {n: getattr(capture, n)[keep] for n in ("laser", "sensor", "laser_normal", "sensor_normal")}
     counts = np.ascontiguousarray(capture.counts[keep, :300])
-    return dataclasses.replace(capture, counts=counts, gate=None, scan_shape=(32, 32), scan_order=None, **fields)
+    return dataclasses.replace(
+        capture, counts=counts, gate=None, scan_shape=(32, 32), scan_order=None, **fields
+    )
 
 
 def by_tal(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
     python = tal_python()
     write_capture(folder / "capture.hdf5", capture)
     options = [str(v) for v in (WAVELENGTH, CYCLES, FIRST, STEP, PLANES)]
-    command = [str(python), str(Path(__file__).with_name("run_tal.py")), str(folder / "capture.hdf5"), str(folder / "out.npz")]
+    command = [
+        str(python),
+        str(Path(__file__).with_name("run_tal.py")),
+        str(folder / "capture.hdf5"),
+        str(folder / "out.npz"),
+    ]
     done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     return dict(np.load(folder / "out.npz"))

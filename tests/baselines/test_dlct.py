@@ -15,7 +15,7 @@ from nlos_lit.baselines.dlct import dlct_field
 from nlos_lit.baselines.light_cone import cone_kernel, light_cone, padded
 from nlos_lit.baselines.surface import front_points
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError, UserError
+from nlos_lit.capture.errors import CaptureError, UserError
 
 GRID = box((-0.484375, 0.484375, 32), (-0.484375, 0.484375, 32), (0.4, 0.8, 81))
 
@@ -24,7 +24,9 @@ def measured_plate(turn_x: float, turn_y: float) -> Capture:
     """Expected values of a plate 0.4 m wide at (0.05, -0.03, 0.6), both cosines at the plate and at the wall included."""
     scan = ScanPlan(nx=32, ny=32, width=1.0, bin_length=0.01, n_bins=200)
     sensor = SensorModel(sigma=0.005, kappa=float("inf"), background=0.0)
-    return simulate_capture(plate((0.05, -0.03, 0.6), 0.4, 0.4, turn_x=turn_x, turn_y=turn_y), scan, sensor, None)[0]
+    return simulate_capture(
+        plate((0.05, -0.03, 0.6), 0.4, 0.4, turn_x=turn_x, turn_y=turn_y), scan, sensor, None
+    )[0]
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,9 @@ def test_normal_of_a_tilted_plate(turn_x, turn_y, normal):
 def test_magnitude_of_a_plate_that_faces_the_wall_is_that_of_the_light_cone_transform():
     capture = measured_plate(0.0, 0.0)
     near = slice(30, 51)  # 0.55 to 0.65 m
-    directed, plain = (reconstruct(capture, GRID, method, snr=30.0)[near].sum(0) for method in ("dlct", "lct"))
+    directed, plain = (
+        reconstruct(capture, GRID, method, snr=30.0)[near].sum(0) for method in ("dlct", "lct")
+    )
     inner = (slice(13, 22), slice(11, 20))
     assert (directed[inner] / plain[inner]).numpy() == pytest.approx(1.0, abs=0.18)
     assert np.corrcoef(directed.ravel(), plain.ravel())[0, 1] > 0.98
@@ -70,13 +74,17 @@ def test_three_channels_solve_the_least_squares_written_out():
     y = np.array([k if k <= size[2] // 2 else k - size[2] for k in range(size[2])]) * 0.15
     kernels = [plain * x[:, None] / depth, plain * y / depth, plain]
     cells = list(itertools.product(*(range(n) for n in size)))
-    matrix = np.concatenate([np.stack([np.roll(k, s, axis=(0, 1, 2)).ravel() for s in cells], axis=1) for k in kernels], axis=1)
+    matrix = np.concatenate(
+        [np.stack([np.roll(k, s, axis=(0, 1, 2)).ravel() for s in cells], axis=1) for k in kernels], axis=1
+    )
     data = np.zeros(size)
     data[tuple(slice(n) for n in shape)] = cone.values.numpy()
     penalty = sum((k**2).sum() for k in kernels) / snr * np.eye(matrix.shape[1])
     solved = np.linalg.solve(matrix.T @ matrix + penalty, matrix.T @ data.ravel()).reshape(3, *size)
     inner = solved[(slice(None), *(slice(n) for n in shape))]
-    at = (0.5**2 - cone.first) / cone.step - 0.5  # where plane z = 0.5 lies among the cells, before averaging over its thickness
+    at = (
+        0.5**2 - cone.first
+    ) / cone.step - 0.5  # where plane z = 0.5 lies among the cells, before averaging over its thickness
     low = int(at)
     plane = (1 - (at - low)) * inner[:, low] + (at - low) * inner[:, low + 1]
     expected = np.stack([2 * 0.5 * plane[0] / depth, 2 * 0.5 * plane[1] / depth, -2 * plane[2]])

@@ -88,7 +88,9 @@ def cut(mesh: Mesh, size: float) -> Elements:
                 np.einsum("kp,fk->fp", share, mesh.albedo[mesh.faces[faces]]).reshape(-1),
             )
         )
-    return Elements(*(np.concatenate([getattr(p, k) for p in parts]) for k in ("centre", "normal", "area", "albedo")))
+    return Elements(
+        *(np.concatenate([getattr(p, k) for p in parts]) for k in ("centre", "normal", "area", "albedo"))
+    )
 
 
 def sight(mesh: Mesh, elements: Elements, wall: np.ndarray) -> np.ndarray:
@@ -149,7 +151,9 @@ def fourth_bounce(elements: Elements, wall: np.ndarray, seen: np.ndarray, axis: 
     leave = np.einsum("abk,ak->ab", gap, elements.normal) / distance
     arrive = -np.einsum("abk,bk->ab", gap, elements.normal) / distance
     strength = elements.area * elements.albedo
-    coupling = np.maximum(leave, 0) * np.maximum(arrive, 0) / distance**2 * np.outer(strength, strength) / np.pi**4
+    coupling = (
+        np.maximum(leave, 0) * np.maximum(arrive, 0) / distance**2 * np.outer(strength, strength) / np.pi**4
+    )
     a, b = np.nonzero(np.triu(coupling, 1))
     light = np.zeros((len(wall), axis.n))
     size = max(1, BLOCK_PATHS // max(1, len(a)))
@@ -158,7 +162,9 @@ def fourth_bounce(elements: Elements, wall: np.ndarray, seen: np.ndarray, axis: 
         d, unit, cosine = _leg(wall[block], elements)
         leg = seen[block] * cosine * -unit[2] / d**2
         # Each pair is walked in both directions, which take equally long.
-        light[block] = _splat(d[:, a] + distance[a, b] + d[:, b], 2 * coupling[a, b] * leg[:, a] * leg[:, b], axis)
+        light[block] = _splat(
+            d[:, a] + distance[a, b] + d[:, b], 2 * coupling[a, b] * leg[:, a] * leg[:, b], axis
+        )
     return light
 
 

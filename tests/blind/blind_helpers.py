@@ -18,14 +18,28 @@ LEVEL = 1500.0
 def points(*places, normal=(0.0, 0.0, -1.0), area=1e-4, albedo=1.0) -> Elements:
     """Elements at places (x, y, z), m."""
     n = len(places)
-    return Elements(np.array(places, dtype=float), np.tile(np.array(normal, float), (n, 1)), np.full(n, area), np.full(n, albedo))
+    return Elements(
+        np.array(places, dtype=float),
+        np.tile(np.array(normal, float), (n, 1)),
+        np.full(n, area),
+        np.full(n, albedo),
+    )
 
 
 def scene_of(elements: Elements) -> Scene:
     """A confocal scan of them, all in view."""
     wall = wall_grid(32, 32, 0.8, 0.8).reshape(-1, 3)
     seen = np.ones((1024, len(elements.area)), dtype=bool)
-    return Scene("points", WINDOW, wall, wall, third_bounce(elements, wall, wall, seen, WINDOW.fine), None, elements, seen)
+    return Scene(
+        "points",
+        WINDOW,
+        wall,
+        wall,
+        third_bounce(elements, wall, wall, seen, WINDOW.fine),
+        None,
+        elements,
+        seen,
+    )
 
 
 @lru_cache(maxsize=1)
@@ -46,7 +60,9 @@ def mean_path(light: np.ndarray, axis: Axis) -> np.ndarray:
 
 def bin_path(counts: np.ndarray) -> np.ndarray:
     """``[S]`` mean arrival of counts, m."""
-    return counts @ (WINDOW.t_start + (np.arange(WINDOW.n_bins) + 0.5) * WINDOW.bin_length) / counts.sum(axis=1)
+    return (
+        counts @ (WINDOW.t_start + (np.arange(WINDOW.n_bins) + 0.5) * WINDOW.bin_length) / counts.sum(axis=1)
+    )
 
 
 def shift_of(work: Work) -> np.ndarray:

@@ -25,7 +25,9 @@ def retroreflection(work: Work, falloff: float) -> dict[str, float]:
         work.light = work.light * ((axis.edges[:-1] + axis.step / 2) / 2) ** (2 * power)
         return {"falloff": falloff, "cosine": 1.0}
     cosine = 1 - power
-    work.light = work.scene.rendered((lambda p: (p.d1 * p.d2) ** power * np.maximum(p.cosine1 * p.cosine2, 1e-12) ** (cosine - 1),))
+    work.light = work.scene.rendered(
+        (lambda p: (p.d1 * p.d2) ** power * np.maximum(p.cosine1 * p.cosine2, 1e-12) ** (cosine - 1),)
+    )
     return {"falloff": falloff, "cosine": cosine}
 
 
@@ -57,7 +59,9 @@ def occlusion(work: Work, opacity: float) -> dict[str, float]:
         through = 1.0
         for wall in (legs.laser, legs.sensor):
             f = z / legs.elements.centre[:, 2]
-            off = [wall[:, k, None] * (1 - f) + legs.elements.centre[:, k] * f - c for k, c in enumerate((x, y))]
+            off = [
+                wall[:, k, None] * (1 - f) + legs.elements.centre[:, k] * f - c for k, c in enumerate((x, y))
+            ]
             through = through * np.where(off[0] ** 2 + off[1] ** 2 < radius**2, 1 - opacity, 1)
         return through
 
@@ -236,7 +240,9 @@ def dead_stripe(work: Work, loss: float) -> dict[str, float]:
 def missing_codes(work: Work, loss: float) -> dict[str, float]:
     arrival = np.cumsum(work.scene.clean.sum(axis=0)) / work.scene.clean.sum()
     first = int(np.searchsorted(arrival, work.rng.uniform(0.3, 0.7)) // FINE) - PAD
-    work.counting.append(lambda m: m * np.where((work.times >= first) & (work.times < first + 5), 1 - loss, 1))
+    work.counting.append(
+        lambda m: m * np.where((work.times >= first) & (work.times < first + 5), 1 - loss, 1)
+    )
     return {"loss": loss, "first": float(first)}
 
 

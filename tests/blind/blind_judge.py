@@ -15,16 +15,16 @@ import torch
 from blind_truth import Spec, Truth, make_capture
 
 from data_modules.readers import read_capture
-from nlos_lit.build import PipelineSettings
 from nlos_lit.capture import Capture
-from nlos_lit.criticism.base import BasePipeline
-from nlos_lit.criticism.criticise import CriticismSettings, Findings, best_likelihood
-from nlos_lit.criticism.joint_step import copy_effects
-from nlos_lit.criticism.refit import Comparison, compare, log_likelihood, refit_with
-from nlos_lit.criticism.result import Diagnosis
-from nlos_lit.criticism.run import diagnose
-from nlos_lit.criticism.split import split_spots
-from nlos_lit.surfel_fit import RefineSettings
+from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.criticise import CriticismSettings, Findings, best_likelihood
+from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.joint_step import copy_effects
+from nlos_lit.inference.refit import Comparison, compare, log_likelihood, refit_with
+from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.split import split_spots
+from nlos_lit.model.build import PipelineSettings
+from nlos_lit.surfels.fit import RefineSettings
 
 SURFELS = RefineSettings(surfel_cost=10.0, prune=3.0)  # conf/surfels/criticism.yaml
 
@@ -82,7 +82,9 @@ def pipeline_for(capture: Capture) -> BasePipeline:
     return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, PipelineSettings(0.1), SURFELS, 2 << 30)
 
 
-def diagnose_file(path: Path, options: CriticismSettings, seed: int = 0) -> tuple[Diagnosis, Findings, Capture]:
+def diagnose_file(
+    path: Path, options: CriticismSettings, seed: int = 0
+) -> tuple[Diagnosis, Findings, Capture]:
     """All that the code under test is given."""
     capture = read_capture(path, "auto")
     pipeline = pipeline_for(capture)
@@ -118,13 +120,17 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         errors=parameter_errors(truth, diagnosis),
         values=truth.values,
         found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
-        screened=[(c.name, c.statistic, c.predicted_gain, c.retained_information) for c in diagnosis.screened[:6]],
+        screened=[
+            (c.name, c.statistic, c.predicted_gain, c.retained_information) for c in diagnosis.screened[:6]
+        ],
         ratio=diagnosis.base.deviance_per_bin / diagnosis.base.deviance_noise,
         seconds=diagnosis.seconds,
     )
 
 
-def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor) -> Comparison:
+def oracle_gain(
+    truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
+) -> Comparison:
     """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
@@ -132,7 +138,10 @@ def oracle_gain(truth: Truth, found: Findings, capture: Capture, options: Critic
     pipeline = pipeline_for(capture)
     anew = pipeline.fit(capture, split, pipeline.image(capture), copy_effects(warm.extension, []), 0)
     block = split.block[split.select]
-    return max((compare(before, log_likelihood(f, split.select), block) for f in (warm, anew)), key=lambda gain: gain.nats)
+    return max(
+        (compare(before, log_likelihood(f, split.select), block) for f in (warm, anew)),
+        key=lambda gain: gain.nats,
+    )
 
 
 def parameter_errors(truth: Truth, diagnosis: Diagnosis) -> dict[str, dict[str, tuple[float, float]]]:

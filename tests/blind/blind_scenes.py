@@ -46,7 +46,9 @@ class Window:
     @property
     def fine(self) -> Axis:
         """The fine axis, `PAD` bins longer at either end."""
-        return Axis(self.t_start - PAD * self.bin_length, self.bin_length / FINE, FINE * (self.n_bins + 2 * PAD))
+        return Axis(
+            self.t_start - PAD * self.bin_length, self.bin_length / FINE, FINE * (self.n_bins + 2 * PAD)
+        )
 
     @property
     def middle(self) -> float:
@@ -108,11 +110,16 @@ class Scene:
         return self.laser is self.sensor
 
     def rendered(
-        self, weights: tuple[Callable[[Legs], np.ndarray], ...] = (), wall: np.ndarray | None = None, lift: float = 0.0
+        self,
+        weights: tuple[Callable[[Legs], np.ndarray], ...] = (),
+        wall: np.ndarray | None = None,
+        lift: float = 0.0,
     ) -> np.ndarray:
         """Light of an own scene with weights on its paths, true ``wall`` points, or the scene ``lift`` m nearer to the wall."""
         wall = self.laser if wall is None else wall
-        return third_bounce(self.elements.moved((0, 0, -lift)), wall, wall, self.seen, self.window.fine, weights)
+        return third_bounce(
+            self.elements.moved((0, 0, -lift)), wall, wall, self.seen, self.window.fine, weights
+        )
 
     def apart(self, sensor: np.ndarray) -> np.ndarray:
         """Light of an own scene where the sensor looks at ``sensor`` ``[S, 3]`` instead of at the laser's points."""
@@ -129,7 +136,9 @@ class Scene:
 
 def available() -> list[str]:
     """Scenes whose data are there."""
-    return [name for name, plan in PLANS.items() if not plan.render or (RENDERS / f"{plan.render}.hdf5").exists()]
+    return [
+        name for name, plan in PLANS.items() if not plan.render or (RENDERS / f"{plan.render}.hdf5").exists()
+    ]
 
 
 @lru_cache(maxsize=8)

@@ -52,7 +52,9 @@ class Spec:
             if scenes and self.scene not in scenes:
                 raise ValueError(f"{name} cannot be hidden in {self.scene}, only in {', '.join(scenes)}")
         if not compatible(self.effects):
-            raise ValueError(f"{' and '.join(self.effects)} both render the scene anew; hide only one of them")
+            raise ValueError(
+                f"{' and '.join(self.effects)} both render the scene anew; hide only one of them"
+            )
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,9 @@ def hide(spec: Spec) -> Truth:
     without = work.expected()
     values, labels = {}, {}
     kinds = EFFECTS | UNKNOWN
-    for name, strength in sorted(zip(spec.effects, spec.strengths, strict=True), key=lambda pair: ORDER.index(pair[0])):
+    for name, strength in sorted(
+        zip(spec.effects, spec.strengths, strict=True), key=lambda pair: ORDER.index(pair[0])
+    ):
         work.rng = np.random.default_rng([spec.seed, zlib.crc32(name.encode())])
         values[name] = kinds[name].inject(work, kinds[name].ladder[strength])
         labels[name] = STRENGTHS[strength]
@@ -177,7 +181,14 @@ def draw_spec(
     )
 
 
-_RENDERED = {"retroreflection", "specular_lobe", "occlusion", "higher_order_bounces", "wall_tilt", "laser_sensor_baseline"}
+_RENDERED = {
+    "retroreflection",
+    "specular_lobe",
+    "occlusion",
+    "higher_order_bounces",
+    "wall_tilt",
+    "laser_sensor_baseline",
+}
 
 
 def compatible(names: tuple[str, ...]) -> bool:
@@ -195,7 +206,9 @@ def _order(name: str) -> np.ndarray:
     return rank.ravel()
 
 
-def _case(name: str, scene: str, level: float = 5000, strength: int = 3, seed: int = 1, order: str = "raster") -> Spec:
+def _case(
+    name: str, scene: str, level: float = 5000, strength: int = 3, seed: int = 1, order: str = "raster"
+) -> Spec:
     return Spec(scene, (name,), (strength,), level, seed, order)
 
 

@@ -89,7 +89,9 @@ def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: f
     edges, middle = scene.window.fine.edges, scene.window.middle
     total = np.concatenate([np.zeros((len(light), 1)), np.cumsum(light, axis=1)], axis=1)
     came = edges + stretch * (edges - middle)
-    return np.stack([np.diff(np.interp(edges, came + late, row)) for late, row in zip(delay, total, strict=True)])
+    return np.stack(
+        [np.diff(np.interp(edges, came + late, row)) for late, row in zip(delay, total, strict=True)]
+    )
 
 
 def wave(work: Work) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 from blind_judge import Outcome, run_case
 from blind_truth import CASES, Spec
 
-from nlos_lit.criticism.criticise import CriticismSettings
+from nlos_lit.inference.criticise import CriticismSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 # Fewer spots, rivals and steps than a diagnosis takes; no rebuilds with what was not asked for.
@@ -44,7 +44,9 @@ def test_nothing_hidden_nothing_named():
 
 def test_two_effects_are_both_named_and_measured():
     names = ("irf_tail", "wall_reflectance")
-    outcome = run_case(Spec("letters", names, (3, 3), 1500, 1), dataclasses.replace(QUICK, most=2), oracle=False)
+    outcome = run_case(
+        Spec("letters", names, (3, 3), 1500, 1), dataclasses.replace(QUICK, most=2), oracle=False
+    )
     check(outcome)
     assert set(outcome.named) == set(names)
     for name, quantity, within in (("irf_tail", "fraction", 0.25), ("wall_reflectance", "rms", 0.15)):
@@ -70,7 +72,11 @@ def test_a_detector_that_saturates_is_not_called_a_dark_wall():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.xfail(reason=HARD[name], strict=False) if name in HARD else ()) for name in CASES]
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.xfail(reason=HARD[name], strict=False) if name in HARD else ())
+        for name in CASES
+    ],
 )
 def test_every_case_of_the_table(name):
     check(run_case(CASES[name], WHOLE, oracle=False))

@@ -17,7 +17,9 @@ def test_delays_below_a_bin_keep_energy_and_move_the_mean(dot):
     delay = np.linspace(-0.02, 0.03, 1024)
     light = moved_in_time(dot.clean, dot, delay, 0.0)
     np.testing.assert_allclose(light.sum(axis=1), dot.clean.sum(axis=1))
-    np.testing.assert_allclose(mean_path(light, WINDOW.fine) - mean_path(dot.clean, WINDOW.fine), delay, atol=1e-12)
+    np.testing.assert_allclose(
+        mean_path(light, WINDOW.fine) - mean_path(dot.clean, WINDOW.fine), delay, atol=1e-12
+    )
 
 
 def test_offset_drift_jitter_and_clock(dot):
@@ -43,7 +45,9 @@ def test_offset_drift_jitter_and_clock(dot):
     work = work_on(dot)
     scale = EFFECTS["clock_scale"].inject(work, 0.03)["scale"]
     path = mean_path(dot.clean, WINDOW.fine)
-    np.testing.assert_allclose(shift_of(work), scale * (path - (1.1 + 112 * 0.008)), atol=0.02 * WINDOW.fine.step)
+    np.testing.assert_allclose(
+        shift_of(work), scale * (path - (1.1 + 112 * 0.008)), atol=0.02 * WINDOW.fine.step
+    )
 
 
 def test_tail_delays_the_mean_by_its_share(dot):
@@ -64,9 +68,13 @@ def test_ghost_comes_again_with_its_share(dot):
     values = EFFECTS["ghost_pulse"].inject(work, 0.15)
     extra = work.signal() - work_on(work.scene).signal()
     near = np.linalg.norm(work.scene.laser, axis=1) < 0.3
-    np.testing.assert_allclose(extra.sum(axis=1)[near] / work_on(work.scene).signal().sum(axis=1)[near], 0.15, rtol=1e-3)
     np.testing.assert_allclose(
-        (bin_path(np.maximum(extra, 0)) - bin_path(work_on(work.scene).signal()))[near], values["delay"], atol=1e-4
+        extra.sum(axis=1)[near] / work_on(work.scene).signal().sum(axis=1)[near], 0.15, rtol=1e-3
+    )
+    np.testing.assert_allclose(
+        (bin_path(np.maximum(extra, 0)) - bin_path(work_on(work.scene).signal()))[near],
+        values["delay"],
+        atol=1e-4,
     )
 
 
@@ -91,7 +99,9 @@ def test_gains(dot):
     EFFECTS["wall_reflectance"].inject(work, 0.2)
     gain = log_gain(work)
     assert gain.std() == pytest.approx(0.2)
-    assert max(np.abs(np.diff(gain.reshape(32, 32), axis=k)).max() for k in (0, 1)) < 0.12  # smooth along both axes
+    assert (
+        max(np.abs(np.diff(gain.reshape(32, 32), axis=k)).max() for k in (0, 1)) < 0.12
+    )  # smooth along both axes
 
     work = work_on(dot)
     strength = EFFECTS["vignetting"].inject(work, 0.5)["strength"]
@@ -113,7 +123,9 @@ def test_backgrounds(dot):
     slope = values["background_slope"]["slope"]
     assert ends / dark == pytest.approx([1 - slope * 223 / 224, 1 + slope * 223 / 224])
     leak = kinds["direct_leak"].background - dark
-    assert leak[5].sum() * 0.008 == pytest.approx(values["direct_leak"]["amplitude"] * values["direct_leak"]["decay"], rel=0.01)
+    assert leak[5].sum() * 0.008 == pytest.approx(
+        values["direct_leak"]["amplitude"] * values["direct_leak"]["decay"], rel=0.01
+    )
     np.testing.assert_array_equal(leak[0], leak[1000])
     assert all(np.array_equal(work.signal(), work_on(dot).signal()) for work in kinds.values())
 
@@ -122,7 +134,9 @@ def test_backgrounds(dot):
 
 
 def counted(name: str, strength: float, counts: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
-    work = work_on(Scene("none", Window(0.008, counts.shape[1], 0.0), np.zeros((len(counts), 3)), np.zeros(0), counts))
+    work = work_on(
+        Scene("none", Window(0.008, counts.shape[1], 0.0), np.zeros((len(counts), 3)), np.zeros(0), counts)
+    )
     values = (EFFECTS | UNKNOWN)[name].inject(work, strength)
     return work.counting[0](counts), values
 
@@ -143,7 +157,9 @@ def test_pile_ups_parameter_is_the_mean_over_spots():
     counts = np.random.default_rng(2).exponential(3.0, (5, 40)) * np.array([1, 2, 3, 4, 5])[:, None]
     recorded, _ = counted("pile_up", 0.3, counts)
     cycles = recorded.sum(axis=1).mean() / 0.3
-    np.testing.assert_allclose(recorded.sum(axis=1), cycles * -np.expm1(-counts.sum(axis=1) / cycles), rtol=1e-9)
+    np.testing.assert_allclose(
+        recorded.sum(axis=1), cycles * -np.expm1(-counts.sum(axis=1) / cycles), rtol=1e-9
+    )
 
 
 def test_afterpulses_follow_every_count():
@@ -162,7 +178,9 @@ def test_codes_gate_and_unknowns():
     ripple, values = counted("tcspc_nonlinearity", 0.1, flat)
     wave = ripple[0] / 10 - 1
     t = np.arange(200)
-    basis = np.stack([np.sin(2 * np.pi * t / values["period"]), np.cos(2 * np.pi * t / values["period"])], axis=1)
+    basis = np.stack(
+        [np.sin(2 * np.pi * t / values["period"]), np.cos(2 * np.pi * t / values["period"])], axis=1
+    )
     found, rest, *_ = np.linalg.lstsq(basis, wave, rcond=None)
     assert np.hypot(*found) == pytest.approx(0.1)
     assert rest < 1e-20
@@ -180,7 +198,8 @@ def test_missing_codes_lie_in_the_light(dot):
     first = int(UNKNOWN["missing_codes"].inject(work, 0.6)["first"])
     ratio = work.expected() / work_on(dot).expected()
     np.testing.assert_allclose(
-        ratio, np.broadcast_to(np.where(np.isin(np.arange(224), range(first, first + 5)), 0.4, 1), ratio.shape)
+        ratio,
+        np.broadcast_to(np.where(np.isin(np.arange(224), range(first, first + 5)), 0.4, 1), ratio.shape),
     )
     arrived = np.cumsum(work.signal().sum(axis=0)) / work.signal().sum()
     assert 0.2 < arrived[first] < 0.9

@@ -29,7 +29,9 @@ def test_files_tell_nothing_and_repeat(tmp_path):
     for name, spec in specs.items():
         make_capture(spec, tmp_path / f"{name}.hdf5")
         with h5py.File(tmp_path / f"{name}.hdf5") as file:
-            infos[name] = {key: (file[key].dtype.str, file[key].shape) for key in file} | {"text": file["scene_info"][()]}
+            infos[name] = {key: (file[key].dtype.str, file[key].shape) for key in file} | {
+                "text": file["scene_info"][()]
+            }
             assert not file.attrs
         data = (tmp_path / f"{name}.hdf5").read_bytes()
         assert not any(word.encode() in data for word in (*EFFECTS, *UNKNOWN, *PLANS))
@@ -114,11 +116,13 @@ def test_no_code_is_shared_with_what_is_tested():
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) else []
-            assert all(n == "nlos_lit.capture" for n in names if n.startswith("nlos_lit")), path
+            assert all(n == "nlos_lit.capture.capture" for n in names if n.startswith("nlos_lit")), path
             assert "torch" not in {n.split(".")[0] for n in names}, path
     code = "import blind_truth, sys; print(*(m for m in sys.modules if m.startswith('nlos_lit.')))"
     environment = {"PYTHONPATH": f"{HERE}:{ROOT}", "PATH": ""}
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, check=True)
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
     loaded = {module.split(".")[1] for module in run.stdout.split()}
     assert "capture" in loaded
     assert not {m for m in loaded if m.startswith(("effects", "surfel", "functional", "criticism"))}

@@ -26,7 +26,14 @@ def test_own_light_is_the_simulators(name):
     normals = np.tile([0.0, 0.0, 1.0], (len(chosen), 1))
     wall = scene.laser[chosen]
     expected = simulate_transients(
-        plan.mesh(), wall, wall, normals, normals, bin_length=window.bin_length, n_bins=window.n_bins, t_start=window.t_start
+        plan.mesh(),
+        wall,
+        wall,
+        normals,
+        normals,
+        bin_length=window.bin_length,
+        n_bins=window.n_bins,
+        t_start=window.t_start,
     )
     mine = scene.clean[chosen].reshape(len(chosen), -1, FINE).sum(axis=2)[:, PAD:-PAD]
     np.testing.assert_allclose(mine.sum(axis=1), expected.sum(axis=1), rtol=0.01)
@@ -38,7 +45,9 @@ def test_own_light_is_the_simulators(name):
 def test_third_bounce_of_one_element_by_hand():
     # Laser right before the element, sensor 0.6 m aside: d1 = 0.8, d2 = 1.0, both cosines at the sensor's leg are 0.8.
     laser, sensor = np.array([[0.0, 0.0, 0.0]]), np.array([[0.6, 0.0, 0.0]])
-    light = third_bounce(points((0, 0, 0.8), area=2e-4, albedo=0.5), laser, sensor, np.ones((1, 1), bool), Axis(0.0, 0.01, 300))
+    light = third_bounce(
+        points((0, 0, 0.8), area=2e-4, albedo=0.5), laser, sensor, np.ones((1, 1), bool), Axis(0.0, 0.01, 300)
+    )
     assert np.flatnonzero(light[0]).tolist() in ([179], [180])
     assert light.sum() == pytest.approx(2e-4 * 0.5 / np.pi**3 * 0.8**2 / (0.8**2 * 1.0**2))
 
@@ -79,7 +88,10 @@ def test_renders_lie_inside_their_window(name):
 def test_the_bunnys_bounces_come_later_than_the_third():
     real_file("rendered/bunny_confocal_32_d8.hdf5")
     scene = load("bunny_confocal")
-    assert mean_path(scene.fourth().sum(0)[None], scene.window.fine) > mean_path(scene.clean.sum(0)[None], scene.window.fine) + 0.1
+    assert (
+        mean_path(scene.fourth().sum(0)[None], scene.window.fine)
+        > mean_path(scene.clean.sum(0)[None], scene.window.fine) + 0.1
+    )
 
 
 # Path
@@ -94,7 +106,9 @@ def test_retroreflection_leaves_only_the_square_of_the_distance():
     split = int(((a + b) - WINDOW.fine.start) / WINDOW.fine.step)
     light = work.light[70]
     # What is left are the wall's cosines and d⁻².
-    assert light[:split].sum() / light[split:].sum() == pytest.approx((0.65 / a / a) ** 2 / (0.9 / b / b) ** 2)
+    assert light[:split].sum() / light[split:].sum() == pytest.approx(
+        (0.65 / a / a) ** 2 / (0.9 / b / b) ** 2
+    )
 
 
 def test_specular_lobe_raises_what_mirrors(dot):

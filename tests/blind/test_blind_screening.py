@@ -10,10 +10,10 @@ from blind_judge import SURFELS, pipeline_for
 from blind_truth import Spec, make_capture
 
 from data_modules.readers import read_capture
-from nlos_lit.criticism.criticise import CriticismSettings, look
-from nlos_lit.criticism.split import split_spots
-from nlos_lit.effects.base import Extension
-from nlos_lit.effects.scan import Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.criticise import CriticismSettings, look
+from nlos_lit.inference.split import split_spots
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 QUICK = dataclasses.replace(SURFELS, rounds=2, steps=60, more=0)

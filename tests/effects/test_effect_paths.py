@@ -27,7 +27,9 @@ def test_specular_lobe_peaks_along_the_mirror_direction():
     # Wall points at x = ±0.75, surfel at depth 1 facing the wall: the half vector is the normal.
     scan = hand_scan([[-0.75, 0, 0]], [[0.75, 0, 0]])
     lobe = effect("specular_lobe", scan=scan, strength=0.5, exponent=4.0)
-    assert lobe.path(ONE, hand_paths(1.25, 1.25, 0.8, 0.8), SPOT).item() == pytest.approx(1 + 0.5 * 3, rel=1e-5)
+    assert lobe.path(ONE, hand_paths(1.25, 1.25, 0.8, 0.8), SPOT).item() == pytest.approx(
+        1 + 0.5 * 3, rel=1e-5
+    )
     # Confocal at 60° from the normal: cos θh = 0.5, 1 + 0.5 · 3 · 0.5⁴.
     lobe = effect("specular_lobe", scan=hand_scan([[0.0, 0, 0]]), strength=0.5, exponent=4.0)
     assert lobe.path(ONE, hand_paths(1, 1, 0.5, 0.5), SPOT).item() == pytest.approx(1 + 1.5 / 16, rel=1e-5)
@@ -85,23 +87,33 @@ def test_baseline_moves_the_sensor_alone():
 
 def test_baseline_is_the_model_of_the_moved_sensor():
     model, _ = scene("exhaustive")
-    baseline, spots = effect("laser_sensor_baseline", "exhaustive", baseline_x=0.02, baseline_y=-0.015), torch.arange(SPOTS)
+    baseline, spots = (
+        effect("laser_sensor_baseline", "exhaustive", baseline_x=0.02, baseline_y=-0.015),
+        torch.arange(SPOTS),
+    )
     stated = model.sensor.clone()
     paths = model.paths(spots)
     model.sensor = stated + torch.tensor([0.02, -0.015, 0.0])
     real = model.paths(spots)
     model.sensor = stated
     assert baseline.time(paths.length, paths, spots).detach() == pytest.approx(real.length.detach(), abs=2e-3)
-    changed, truth = baseline.path(paths.contribution, paths, spots).sum(2).detach(), real.contribution.sum(2).detach()
+    changed, truth = (
+        baseline.path(paths.contribution, paths, spots).sum(2).detach(),
+        real.contribution.sum(2).detach(),
+    )
     lit = truth > 0.05 * truth.max()
     assert changed[lit] == pytest.approx(truth[lit], rel=0.01)
 
 
 def test_offsets_of_time():
     paths, lengths = hand_paths(), torch.full((1, 1, 1), 1.52)
-    assert effect("time_offset", offset=0.05).time(lengths, paths, SPOT).item() == pytest.approx(1.57, abs=1e-6)
+    assert effect("time_offset", offset=0.05).time(lengths, paths, SPOT).item() == pytest.approx(
+        1.57, abs=1e-6
+    )
     # The gate's middle is at 0.62 + 0.02 · 35 = 1.32 m: 0.2 m from it becomes 0.21 m.
-    assert effect("clock_scale", scale=0.05).time(lengths, paths, SPOT).item() == pytest.approx(1.53, abs=1e-6)
+    assert effect("clock_scale", scale=0.05).time(lengths, paths, SPOT).item() == pytest.approx(
+        1.53, abs=1e-6
+    )
     jitter = effect("timing_jitter", offset=torch.tensor([0.03, -0.04] + [0.0] * (SPOTS - 2)))
     assert jitter.time(lengths, paths, torch.tensor([1])).item() == pytest.approx(1.48, abs=1e-6)
     sigma = jitter.quantities()["sigma"].value.item()
@@ -121,7 +133,9 @@ def test_time_drift_follows_the_order_of_acquisition():
     # rms: orthonormal functions; peak to peak: the extremes.
     quantities = drift.quantities()
     assert quantities["rms"].value.item() == pytest.approx(math.sqrt(shift.square().mean().item()), abs=1e-5)
-    assert quantities["peak_to_peak"].value.item() == pytest.approx((shift.max() - shift.min()).item(), abs=1e-6)
+    assert quantities["peak_to_peak"].value.item() == pytest.approx(
+        (shift.max() - shift.min()).item(), abs=1e-6
+    )
     # A straight line over the scan order is among its functions.
     rank = drift.scan.rank
     line = drift.functions @ (drift.functions.T @ rank) / SPOTS

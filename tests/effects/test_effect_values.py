@@ -11,8 +11,10 @@ import torch
 from effect_contract import BIN, GATE, SPOTS, capture, scene
 from effect_hand import SPOT, effect, hand_scan
 
-from nlos_lit.effects import EFFECTS, Extension, Scan
-from nlos_lit.effects.basis import smooth_basis, smooth_map_basis, spline_basis
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
 
 FIRST, LAST = GATE
 
@@ -49,9 +51,13 @@ def test_gains_of_spots():
     assert vignetting[:, 7] == pytest.approx(3 * torch.exp(-0.3 * (place[spots] ** 2).sum(1)), rel=1e-5)
     drift = effect("power_drift")
     drift.set("drift", torch.tensor([0.1, -0.2, 0.0, 0.3, 0.05]))
-    assert drift.gain(signal, spots)[:, 3].detach() == pytest.approx(3 * torch.exp(drift.field()[spots]).detach(), rel=1e-5)
+    assert drift.gain(signal, spots)[:, 3].detach() == pytest.approx(
+        3 * torch.exp(drift.field()[spots]).detach(), rel=1e-5
+    )
     assert drift.field().mean().item() == pytest.approx(0, abs=1e-6)
-    assert drift.quantities()["rms"].value.item() == pytest.approx(math.sqrt(0.01 + 0.04 + 0.09 + 0.0025), abs=1e-4)
+    assert drift.quantities()["rms"].value.item() == pytest.approx(
+        math.sqrt(0.01 + 0.04 + 0.09 + 0.0025), abs=1e-4
+    )
 
 
 def grid_scan(n: int) -> Scan:
@@ -87,7 +93,9 @@ def test_reflectance_is_one_map_of_both_wall_points():
     assert field.abs().max() > 0.05
     # Both points at one place: the gain of that place twice, e^{2f}, so functions of mean square 4.
     twice = effect("wall_reflectance", scan=hand_scan(points[0].tolist(), points[0].tolist()))
-    assert twice.functions.square().mean(0) == pytest.approx(torch.full((twice.functions.shape[1],), 4.0), rel=1e-4)
+    assert twice.functions.square().mean(0) == pytest.approx(
+        torch.full((twice.functions.shape[1],), 4.0), rel=1e-4
+    )
 
 
 def test_backgrounds():
@@ -101,7 +109,9 @@ def test_backgrounds():
     extra[3], extra[5], extra[6] = 4.0, 2.0, 0.01
     hot = effect("hot_spots", extra=extra)
     assert hot.background(level, spots)[:, 0].tolist() == pytest.approx([6.0, 2.0])
-    assert {n: q.value.item() for n, q in hot.quantities().items()} == pytest.approx({"level": 3.0, "number": 2.0})
+    assert {n: q.value.item() for n, q in hot.quantities().items()} == pytest.approx(
+        {"level": 3.0, "number": 2.0}
+    )
     assert effect("hot_spots").quantities()["number"].value.item() == 0
     leak = effect("direct_leak", amplitude=5.0, decay=4 * BIN).background(level, spots).detach()
     assert leak[[0, 6, 10]].tolist() == pytest.approx([7.0, 7.0, 2 + 5 / math.e], rel=1e-5)
@@ -146,7 +156,9 @@ def test_ripple_and_edges_of_the_gate():
     edges = effect("gate_edges", start=0.5, end=0.2, width=2.0)
     seen = edges.counting(counts, SPOT)[0].detach()
     by_hand = [10, 5, 10 * (1 - 0.5 / math.e), 10 * (1 - 0.2 / math.e), 8]
-    assert seen[[FIRST - 1, FIRST, FIRST + 2, LAST - 3, LAST - 1]].tolist() == pytest.approx(by_hand, rel=1e-5)
+    assert seen[[FIRST - 1, FIRST, FIRST + 2, LAST - 3, LAST - 1]].tolist() == pytest.approx(
+        by_hand, rel=1e-5
+    )
 
 
 def test_no_frequency_of_a_ripple_is_missed():
@@ -180,7 +192,9 @@ def test_splines_sum_to_one_and_are_smooth():
     assert share[:3] == pytest.approx([1, 1 / 4, 1 / 9], rel=0.02)
     assert share.diff().max() < 0
     # Few points: as many functions as they can tell apart.
-    assert smooth_map_basis(torch.rand(4, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1, 6)[0].shape == (4, 3)
+    assert smooth_map_basis(torch.rand(4, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1, 6)[
+        0
+    ].shape == (4, 3)
     assert smooth_basis(torch.zeros(1), 6)[0].shape == (1, 0)
 
 
@@ -221,7 +235,9 @@ def test_a_fixed_laser_works(built):
     """Single-laser scans, all effects at their nulls: nothing changes."""
     model, scan = scene("single")
     spots = torch.arange(SPOTS)
-    assert model.expected(spots, Extension([built(scan)])) == pytest.approx(model.expected(spots), rel=1e-5, abs=1e-4)
+    assert model.expected(spots, Extension([built(scan)])) == pytest.approx(
+        model.expected(spots), rel=1e-5, abs=1e-4
+    )
 
 
 def test_one_spot_is_enough():

@@ -7,9 +7,10 @@ import sys
 import pytest
 from effect_contract import EffectContract, capture, registered
 
-from nlos_lit.effects import EFFECTS, Scan, build_effects
-from nlos_lit.effects.base import STAGES
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS, build_effects
+from nlos_lit.effects.effect import STAGES
 
 
 class TestRetroreflection(EffectContract, effect=registered("retroreflection"), falloff=2.3, cosine=0.4):
@@ -20,7 +21,9 @@ class TestSpecularLobe(EffectContract, effect=registered("specular_lobe"), stren
     pass
 
 
-class TestOcclusion(EffectContract, effect=registered("occlusion"), opacity=0.7, x=0.05, y=-0.08, z=0.25, radius=0.2):
+class TestOcclusion(
+    EffectContract, effect=registered("occlusion"), opacity=0.7, x=0.05, y=-0.08, z=0.25, radius=0.2
+):
     pass
 
 
@@ -32,7 +35,9 @@ class TestWallTilt(EffectContract, effect=registered("wall_tilt"), tilt_x=0.03, 
     pass
 
 
-class TestLaserSensorBaseline(EffectContract, effect=registered("laser_sensor_baseline"), baseline_x=0.03, baseline_y=-0.02):
+class TestLaserSensorBaseline(
+    EffectContract, effect=registered("laser_sensor_baseline"), baseline_x=0.03, baseline_y=-0.02
+):
     pass
 
 
@@ -96,7 +101,9 @@ class TestPileUp(EffectContract, effect=registered("pile_up"), detections=0.5):
     pass
 
 
-class TestTcspcNonlinearity(EffectContract, effect=registered("tcspc_nonlinearity"), sine=0.05, cosine=-0.03, period=9.3):
+class TestTcspcNonlinearity(
+    EffectContract, effect=registered("tcspc_nonlinearity"), sine=0.05, cosine=-0.03, period=9.3
+):
     pass
 
 
@@ -105,7 +112,11 @@ class TestGateEdges(EffectContract, effect=registered("gate_edges"), start=0.6, 
 
 
 def test_every_effect_is_tested_and_named_once():
-    contracts = [c for c in vars(sys.modules[__name__]).values() if isinstance(c, type) and issubclass(c, EffectContract)]
+    contracts = [
+        c
+        for c in vars(sys.modules[__name__]).values()
+        if isinstance(c, type) and issubclass(c, EffectContract)
+    ]
     tested = {c.effect for c in contracts if c is not EffectContract}
     assert tested == set(EFFECTS)
     assert len(EFFECTS) == 23
@@ -120,7 +131,9 @@ def test_effects_act_in_the_order_of_stages():
 
 def test_build_effects_follows_the_registry_and_refuses_unknown_names():
     scan = Scan.of(capture("single"))
-    names = [effect.name for effect in build_effects(["pile_up", "time_offset", "afterpulsing", "pile_up"], scan)]
+    names = [
+        effect.name for effect in build_effects(["pile_up", "time_offset", "afterpulsing", "pile_up"], scan)
+    ]
     assert names == ["time_offset", "afterpulsing", "pile_up"]
     assert build_effects([], scan) == []
     with pytest.raises(UserError, match=r"'sun'.*choose from retroreflection, .*gate_edges"):

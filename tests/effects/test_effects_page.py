@@ -43,12 +43,18 @@ def test_the_example_is_not_in_the_registry():
 
 
 def test_the_table_lists_the_registry():
-    rows = [[c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]] for line in PAGE.splitlines() if line.startswith("| `")]
+    rows = [
+        [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
+        for line in PAGE.splitlines()
+        if line.startswith("| `")
+    ]
     assert [row[0].strip("`") for row in rows] == [effect.name for effect in EFFECTS]
     scan = scene("confocal")[1]
     for row, effect in zip(rows, EFFECTS, strict=True):
         assert row[1] == effect.stage
         declared = effect.declare(scan)
         assert re.findall(r"`(\w+)`", row[3]) == [p.name for p in declared], effect.name
-        assert {p.unit for p in declared} == set(re.findall(r"\((1|m|rad|bins|counts/bin)\)", row[3])), effect.name
+        assert {p.unit for p in declared} == set(re.findall(r"\((1|m|rad|bins|counts/bin)\)", row[3])), (
+            effect.name
+        )
         assert any(p.null is None for p in declared) == ("scanned" in row[3]), effect.name

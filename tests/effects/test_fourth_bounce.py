@@ -11,20 +11,25 @@ import torch
 from effect_contract import scene, surfels
 
 from nlos_lit.capture import Capture
-from nlos_lit.effects import Extension, Scan
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.higher_order_bounces import CLUSTERS, HigherOrderBounces, clusters
-from nlos_lit.surfels import SurfelModel
+from nlos_lit.surfels.model import SurfelModel
 
 BIN, T_START, N_BINS = 0.01, 0.5, 400
 
 
 def valley(confocal: bool, per_side: int = 8, opening: float = 1.0) -> tuple[Capture, SurfelModel]:
     """Two plates that meet in a valley (a ridge for a negative opening), one of them darker, over a 5 × 3 scan."""
-    xy = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.3, 3), indexing="ij"), -1).reshape(-1, 2)
+    xy = np.stack(
+        np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.3, 3), indexing="ij"), -1
+    ).reshape(-1, 2)
     laser = np.column_stack([xy, np.zeros(15)])
     sensor = laser if confocal else laser[::-1] * [0.5, 0.7, 0] + [0.05, 0.0, 0.0]
     up = np.broadcast_to([0.0, 0.0, 1.0], (15, 3))
-    scene = Capture(np.ones((15, N_BINS), dtype=np.uint16), laser, sensor, up, up, bin_length=BIN, t_start=T_START)
+    scene = Capture(
+        np.ones((15, N_BINS), dtype=np.uint16), laser, sensor, up, up, bin_length=BIN, t_start=T_START
+    )
     line = (np.arange(2 * per_side) + 0.5) / per_side - 1
     x, y = (g.ravel() * 0.3 for g in np.meshgrid(line, line, indexing="ij"))
     centre = np.column_stack([x, y, 0.8 - opening * np.abs(x)])
@@ -37,7 +42,9 @@ def valley(confocal: bool, per_side: int = 8, opening: float = 1.0) -> tuple[Cap
 
 def all_pairs(capture: Capture, model: SurfelModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Energy, mean arrival (m) and its standard deviation for each spot, from ρ_a ρ_b/π · form factors, in numpy."""
-    centre, normal, albedo = (t.detach().double().numpy() for t in (model.centre(), model.normal(), model.albedo()))
+    centre, normal, albedo = (
+        t.detach().double().numpy() for t in (model.centre(), model.normal(), model.albedo())
+    )
     area = float(model.cell.prod()) / -normal[:, 2]
     gap = centre[None] - centre[:, None]
     d = np.linalg.norm(gap, axis=2) + np.eye(len(centre))
@@ -87,13 +94,17 @@ def test_two_surfels_by_hand():
     """Surfels at (±0.4, 0, 0.8), turned by 45° towards each other: both cosines between them are √½, d = 0.8."""
     model = valley(True)[1]
     wall, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
-    capture = Capture(np.ones((1, N_BINS), dtype=np.uint16), wall, wall, up, up, bin_length=BIN, t_start=T_START)
+    capture = Capture(
+        np.ones((1, N_BINS), dtype=np.uint16), wall, wall, up, up, bin_length=BIN, t_start=T_START
+    )
     model.laser, model.sensor = torch.zeros(1, 3), torch.zeros(1, 3)
     half = math.sqrt(0.5)
     model.quadrature = 1
     model.cell = torch.tensor([0.01, 0.01])
     model.place(
-        torch.tensor([[-0.4, 0, 0.8], [0.4, 0, 0.8]]), torch.tensor([[half, 0, -half], [-half, 0, -half]]), torch.tensor([0.5, 0.8])
+        torch.tensor([[-0.4, 0, 0.8], [0.4, 0, 0.8]]),
+        torch.tensor([[half, 0, -half], [-half, 0, -half]]),
+        torch.tensor([0.5, 0.8]),
     )
     ours = fourth(capture, model)[0]
     # Legs √0.8; cosθ_wall = 0.8/√0.8, cosθ_surfel = (0.4 + 0.8) √½/√0.8; area 10⁻⁴ √2.
@@ -141,7 +152,11 @@ def test_share_is_known_after_a_rendering():
 def test_surfels_in_the_same_place_keep_it_finite():
     capture, model = valley(True, 4)
     centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
-    model.place(centre[[0, 0, *range(1, len(centre))]], normal[[0, 5, *range(1, len(normal))]], albedo[[0, *range(len(albedo))]])
+    model.place(
+        centre[[0, 0, *range(1, len(centre))]],
+        normal[[0, 5, *range(1, len(normal))]],
+        albedo[[0, *range(len(albedo))]],
+    )
     spots = torch.arange(capture.n_spots)
     paths = model.paths(spots)
     effect = HigherOrderBounces(Scan.of(capture))

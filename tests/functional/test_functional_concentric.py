@@ -8,13 +8,21 @@ import literal
 import pytest
 import torch
 
-from nlos_lit.functional.concentric import LIPSCHITZ, hemisphere_to_square, ray_grid, square_to_hemisphere, wall_frame
+from nlos_lit.functional.concentric import (
+    LIPSCHITZ,
+    hemisphere_to_square,
+    ray_grid,
+    square_to_hemisphere,
+    wall_frame,
+)
 
 DOUBLE = torch.float64
 
 
 def test_hand_computed_directions():
-    square = torch.tensor([[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [0.5, 0], [-0.5, 0.25]], dtype=DOUBLE)
+    square = torch.tensor(
+        [[0, 0], [1, 0], [0, 1], [-1, 0], [0, -1], [1, 1], [0.5, 0], [-0.5, 0.25]], dtype=DOUBLE
+    )
     half = math.sqrt(0.5)
     long = 0.5 * math.sqrt(1.75)
     expected = [
@@ -66,7 +74,9 @@ def pairs(count: int, seed: int):
     side = torch.randn(count, 3, dtype=DOUBLE, generator=generator)
     side = side - (side * first).sum(1, keepdim=True) * first
     side = side / side.norm(dim=1, keepdim=True)
-    angle = torch.exp(torch.empty(count, dtype=DOUBLE).uniform_(math.log(1e-3), math.log(math.pi / 2), generator=generator))
+    angle = torch.exp(
+        torch.empty(count, dtype=DOUBLE).uniform_(math.log(1e-3), math.log(math.pi / 2), generator=generator)
+    )
     second = first * angle.cos()[:, None] + side * angle.sin()[:, None]
     above = second[:, 2] >= 0
     return first[above], second[above], angle[above]
@@ -74,7 +84,9 @@ def pairs(count: int, seed: int):
 
 def test_lipschitz_bound_holds_and_is_tight():
     first, second, angle = pairs(400_000, seed=2)
-    stretch = ((hemisphere_to_square(first) - hemisphere_to_square(second)).abs().amax(1) / angle).max().item()
+    stretch = (
+        ((hemisphere_to_square(first) - hemisphere_to_square(second)).abs().amax(1) / angle).max().item()
+    )
     assert 0.97 * LIPSCHITZ < stretch <= LIPSCHITZ
     assert math.sqrt(0.25 + 16 / math.pi**2) <= LIPSCHITZ < 1.01 * math.sqrt(0.25 + 16 / math.pi**2)
 
@@ -86,14 +98,20 @@ def test_continuous_across_the_seams():
         s = math.sqrt(1 - z * z)
 
         def at(shift, s=s, z=z):
-            return torch.stack([s * torch.cos(angle + shift), s * torch.sin(angle + shift), torch.full_like(angle, z)], dim=1)
+            return torch.stack(
+                [s * torch.cos(angle + shift), s * torch.sin(angle + shift), torch.full_like(angle, z)], dim=1
+            )
 
         assert (hemisphere_to_square(at(-1e-9)) - hemisphere_to_square(at(1e-9))).abs().max() < 1e-8
 
 
 def test_wall_frames_are_rotations_onto_the_normal():
-    normals = torch.nn.functional.normalize(torch.randn(200, 3, dtype=DOUBLE, generator=torch.manual_seed(3)), dim=1)
-    normals = torch.cat([normals, torch.tensor([[0.0, 0, 1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [0, 0, -1]], dtype=DOUBLE)])
+    normals = torch.nn.functional.normalize(
+        torch.randn(200, 3, dtype=DOUBLE, generator=torch.manual_seed(3)), dim=1
+    )
+    normals = torch.cat(
+        [normals, torch.tensor([[0.0, 0, 1], [0, 1, 0], [0, -1, 0], [1, 0, 0], [0, 0, -1]], dtype=DOUBLE)]
+    )
     frames = wall_frame(normals)
     identity = torch.eye(3, dtype=DOUBLE).expand_as(frames)
     assert torch.allclose(frames.transpose(1, 2) @ frames, identity, atol=1e-12)

@@ -18,14 +18,19 @@ DOUBLE = torch.float64
 def times(sigma: float, kappa: float) -> np.ndarray:
     """Both tails of the Gaussian, and far into the exponential's."""
     near = np.linspace(-9, 9, 61) * sigma
-    return np.unique(np.concatenate([near, np.geomspace(1e-3, 40, 30) / kappa, -np.geomspace(1e-3, 30, 12) * sigma]))
+    return np.unique(
+        np.concatenate([near, np.geomspace(1e-3, 40, 30) / kappa, -np.geomspace(1e-3, 30, 12) * sigma])
+    )
 
 
 def exact_cdf(t: float, sigma: float, kappa: float) -> mpmath.mpf:
     with mpmath.workdps(60):
         t, sigma, kappa = mpmath.mpf(t), mpmath.mpf(sigma), mpmath.mpf(kappa)
         tail = mpmath.erfc(-(t / sigma - kappa * sigma) / mpmath.sqrt(2)) / 2
-        return mpmath.erfc(-t / sigma / mpmath.sqrt(2)) / 2 - mpmath.exp(-kappa * t + (kappa * sigma) ** 2 / 2) * tail
+        return (
+            mpmath.erfc(-t / sigma / mpmath.sqrt(2)) / 2
+            - mpmath.exp(-kappa * t + (kappa * sigma) ** 2 / 2) * tail
+        )
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -33,7 +38,9 @@ def exact_cdf(t: float, sigma: float, kappa: float) -> mpmath.mpf:
 def test_cdf_is_scipys(shape, sigma):
     kappa = shape / sigma
     t = times(sigma, kappa)
-    found = emg_cdf(torch.from_numpy(t), torch.tensor(sigma, dtype=DOUBLE), torch.tensor(kappa, dtype=DOUBLE)).numpy()
+    found = emg_cdf(
+        torch.from_numpy(t), torch.tensor(sigma, dtype=DOUBLE), torch.tensor(kappa, dtype=DOUBLE)
+    ).numpy()
     expected = exponnorm.cdf(t, 1 / shape, scale=sigma)
     assert np.abs(found - expected).max() < 1e-9
     assert (np.diff(found) > -1e-12).all()
@@ -57,7 +64,13 @@ def test_cdf_and_gradients_are_exact(shape):
 
 
 def test_no_nan_anywhere():
-    t = torch.cat([-torch.logspace(-6, 6, 60, dtype=DOUBLE), torch.zeros(1, dtype=DOUBLE), torch.logspace(-6, 6, 60, dtype=DOUBLE)])
+    t = torch.cat(
+        [
+            -torch.logspace(-6, 6, 60, dtype=DOUBLE),
+            torch.zeros(1, dtype=DOUBLE),
+            torch.logspace(-6, 6, 60, dtype=DOUBLE),
+        ]
+    )
     for sigma in (1e-3, 0.1, 1.0, 30.0, 1e3):
         for kappa in (1e-6, 1e-2, 1.0, 50.0, 1e4):
             s, k = (torch.tensor(v, dtype=DOUBLE, requires_grad=True) for v in (sigma, kappa))

@@ -38,7 +38,9 @@ def dense(volume, grid: Lattice, origins, frames, rays, threshold, step, reach, 
 
 
 def marched(volume, grid, origins, frames, rays, threshold, step, reach, chunk=1 << 20):
-    found = march(volume, grid, origins, frames, rays, threshold=threshold, step=step, reach=reach, chunk=chunk)
+    found = march(
+        volume, grid, origins, frames, rays, threshold=threshold, step=step, reach=reach, chunk=chunk
+    )
     number = torch.round(found.distance / step - 0.5).long()
     assert torch.allclose((number + 0.5) * step, found.distance, atol=1e-6)
     line = (found.spot * rays.shape[0] + found.ray)[found.hit]
@@ -62,11 +64,17 @@ def scene(seed: int):
         uniform(0.01, 0.05),
     ]
     origin = [-0.5 * pitch[0] * shape[1], -0.4 * pitch[1] * shape[2], uniform(0.02, 0.3)]
-    volume = torch.rand(shape, generator=generator) * (torch.rand(shape, generator=generator) < uniform(0.003, 0.08))
+    volume = torch.rand(shape, generator=generator) * (
+        torch.rand(shape, generator=generator) < uniform(0.003, 0.08)
+    )
     volume[shape[0] // 2, shape[1] // 2, shape[2] // 2] = 1.0
     origins = (torch.rand(5, 3, generator=generator) - 0.5) * torch.tensor([0.8, 0.8, 0.02])
-    origins[4] = torch.tensor(origin) + torch.tensor(pitch) * torch.tensor([shape[1], shape[2], shape[0]]) * 0.37
-    tilt = torch.randn(5, 3, generator=generator) * torch.tensor([0.6, 0.6, 0.0]) * (seed % 2) + torch.tensor([0.0, 0.0, 1.0])
+    origins[4] = (
+        torch.tensor(origin) + torch.tensor(pitch) * torch.tensor([shape[1], shape[2], shape[0]]) * 0.37
+    )
+    tilt = torch.randn(5, 3, generator=generator) * torch.tensor([0.6, 0.6, 0.0]) * (seed % 2) + torch.tensor(
+        [0.0, 0.0, 1.0]
+    )
     frames = wall_frame(torch.nn.functional.normalize(tilt, dim=1))
     return volume, lattice(origin, pitch, shape), origins, frames
 
@@ -130,7 +138,14 @@ def test_samples_below_the_threshold_carry_no_weight_however_close_to_the_maximu
     grid = lattice([-0.05, -0.05, 0.3], [0.1, 0.1, 0.1], (2, 2, 2))
     volume = torch.tensor([0.5, 0.7])[:, None, None].expand(2, 2, 2).contiguous()
     found = march(
-        volume, grid, torch.zeros(1, 3), torch.eye(3)[None], torch.tensor([[0.0, 0, 1]]), threshold=0.63, step=0.02, reach=1
+        volume,
+        grid,
+        torch.zeros(1, 3),
+        torch.eye(3)[None],
+        torch.tensor([[0.0, 0, 1]]),
+        threshold=0.63,
+        step=0.02,
+        reach=1,
     )
     assert torch.allclose(found.distance.sort().values, torch.tensor([0.37, 0.39]), atol=1e-6)
 
@@ -138,11 +153,21 @@ def test_samples_below_the_threshold_carry_no_weight_however_close_to_the_maximu
 def test_empty_volume_and_volume_behind_the_wall():
     rays, frames, origin = ray_grid(8), torch.eye(3)[None], torch.zeros(1, 3)
     empty = march(
-        torch.zeros(3, 3, 3), lattice([0.0, 0, 0.1], [0.1] * 3, (3, 3, 3)), origin, frames, rays, threshold=0.1, step=0.01, reach=1
+        torch.zeros(3, 3, 3),
+        lattice([0.0, 0, 0.1], [0.1] * 3, (3, 3, 3)),
+        origin,
+        frames,
+        rays,
+        threshold=0.1,
+        step=0.01,
+        reach=1,
     )
     assert [len(part) for part in empty] == [0, 0, 0, 0]
     behind = lattice([-0.1, -0.1, -0.6], [0.1] * 3, (3, 3, 3))
-    assert len(march(torch.ones(3, 3, 3), behind, origin, frames, rays, threshold=0.1, step=0.01, reach=1).spot) == 0
+    assert (
+        len(march(torch.ones(3, 3, 3), behind, origin, frames, rays, threshold=0.1, step=0.01, reach=1).spot)
+        == 0
+    )
 
 
 @pytest.mark.parametrize("size", [(1, 1, 1), (3, 4, 4), (7, 2, 5), (40, 40, 40)])
@@ -169,7 +194,9 @@ def test_trilinear_by_hand():
     volume = torch.arange(24.0).reshape(3, 2, 4) ** 2
     centres = torch.tensor([[1.5, -2.75, 0.6], [1.0, -2.0, 0.5], [1.5, -2.0, 0.7]])
     assert torch.allclose(
-        trilinear(volume, centres, grid), torch.stack([volume[1, 1, 3], volume[0, 0, 0], volume[2, 1, 0]]), atol=1e-3
+        trilinear(volume, centres, grid),
+        torch.stack([volume[1, 1, 3], volume[0, 0, 0], volume[2, 1, 0]]),
+        atol=1e-3,
     )
     middle = torch.tensor([[1.25, -2.0, 0.5], [1.0, -2.125, 0.5], [1.0, -2.0, 0.55], [1.25, -2.375, 0.65]])
     expected = torch.stack([
@@ -182,10 +209,14 @@ def test_trilinear_by_hand():
 
 
 def test_trilinear_gradients():
-    grid = Lattice(torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64), (3, 4, 3))
+    grid = Lattice(
+        torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64), (3, 4, 3)
+    )
     generator = torch.manual_seed(6)
     volume = torch.rand(3, 4, 3, dtype=torch.float64, generator=generator, requires_grad=True)
-    points = (torch.rand(7, 3, dtype=torch.float64, generator=generator) * torch.tensor([0.85, 0.35, 0.95])).requires_grad_()
+    points = (
+        torch.rand(7, 3, dtype=torch.float64, generator=generator) * torch.tensor([0.85, 0.35, 0.95])
+    ).requires_grad_()
     assert torch.autograd.gradcheck(lambda v, p: trilinear(v, p, grid), (volume, points))
 
 

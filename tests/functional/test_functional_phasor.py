@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from nlos_lit.functional.even import next_fast_length
+from nlos_lit.functional.even_convolution import next_fast_length
 from nlos_lit.functional.phasor import (
     PhasorMagnitude,
     direct_phasors,
@@ -29,7 +29,9 @@ def test_virtual_illumination_is_the_pulses_spectrum():
     omega = torch.tensor([10.0, 35.0, 40.0, 47.0], dtype=DOUBLE)
     t = torch.linspace(-1.5, 1.5, 20001, dtype=DOUBLE)
     pulse = torch.exp(1j * 40.0 * t) * torch.exp(-(t**2) / (2 * 0.1**2))
-    integral = (pulse * torch.exp(-1j * omega[:, None] * t)).sum(1) * (t[1] - t[0]) / (0.1 * math.sqrt(2 * math.pi))
+    integral = (
+        (pulse * torch.exp(-1j * omega[:, None] * t)).sum(1) * (t[1] - t[0]) / (0.1 * math.sqrt(2 * math.pi))
+    )
     found = virtual_illumination(omega, torch.tensor(40.0, dtype=DOUBLE), torch.tensor(0.1, dtype=DOUBLE))
     assert torch.allclose(found, integral.real, atol=1e-9)
 
@@ -53,7 +55,9 @@ def test_frequencies_are_harmonics_of_the_period_over_the_whole_band():
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4])
-@pytest.mark.parametrize(("omega_bounds", "sigma_bounds"), [((15.0, 60.0), (0.06, 0.3)), ((100.0, 300.0), (0.012, 0.055))])
+@pytest.mark.parametrize(
+    ("omega_bounds", "sigma_bounds"), [((15.0, 60.0), (0.06, 0.3)), ((100.0, 300.0), (0.012, 0.055))]
+)
 def test_basis_holds_every_admissible_spectrum(tolerance, omega_bounds, sigma_bounds):
     omega = frequencies(omega_bounds, sigma_bounds[0], period=2.0 + 4 * sigma_bounds[1])
     basis = weight_basis(omega, omega_bounds, sigma_bounds, tolerance)
@@ -70,7 +74,9 @@ def test_basis_holds_every_admissible_spectrum(tolerance, omega_bounds, sigma_bo
 class Scan:
     """A random field on a lattice, and the voxels imaged through it."""
 
-    def __init__(self, *, nx=6, ny=5, mx=8, my=4, pitch=(0.07, 0.05), offset=(-1, 1), scans=1, confocal=True, seed=0):
+    def __init__(
+        self, *, nx=6, ny=5, mx=8, my=4, pitch=(0.07, 0.05), offset=(-1, 1), scans=1, confocal=True, seed=0
+    ):
         generator = torch.manual_seed(seed)
         self.omega = torch.arange(4, 12, dtype=DOUBLE) * 5.1
         self.basis = torch.linalg.qr(torch.randn(8, 3, dtype=DOUBLE, generator=generator))[0]
@@ -78,10 +84,16 @@ class Scan:
         self.pitch, self.offset, self.shape = pitch, offset, (mx, my)
         self.depth = torch.tensor([0.21, 0.37, 0.9], dtype=DOUBLE)
         x0, y0 = -0.13, 0.08
-        x, y = torch.meshgrid(torch.arange(nx, dtype=DOUBLE) * pitch[0], torch.arange(ny, dtype=DOUBLE) * pitch[1], indexing="ij")
+        x, y = torch.meshgrid(
+            torch.arange(nx, dtype=DOUBLE) * pitch[0],
+            torch.arange(ny, dtype=DOUBLE) * pitch[1],
+            indexing="ij",
+        )
         self.aperture = torch.stack([x0 + x, y0 + y, torch.zeros_like(x)], -1).reshape(-1, 3)
         self.voxel_origin = (x0 + offset[0] * pitch[0], y0 + offset[1] * pitch[1])
-        self.fixed = None if confocal else (torch.rand(scans, 3, dtype=DOUBLE, generator=generator) - 0.5) * 0.4
+        self.fixed = (
+            None if confocal else (torch.rand(scans, 3, dtype=DOUBLE, generator=generator) - 0.5) * 0.4
+        )
         self.voxels = literal.voxel_centres((*self.voxel_origin, 0), (*pitch, 1), (3, mx, my))
         self.voxels[..., 2] = self.depth[:, None, None]
 
@@ -99,7 +111,13 @@ class Scan:
 
     def direct(self, block=7):
         field, laser, sensor = self.spots()
-        return torch.cat(list(direct_phasors(field, self.omega, self.basis, laser, sensor, self.voxels.reshape(-1, 3), block)))
+        return torch.cat(
+            list(
+                direct_phasors(
+                    field, self.omega, self.basis, laser, sensor, self.voxels.reshape(-1, 3), block
+                )
+            )
+        )
 
     def written_out(self):
         field, laser, sensor = self.spots()
@@ -130,7 +148,10 @@ def test_propagation_is_the_sum_written_out(name):
     expected = scan.written_out()
     assert literal.relative(scan.lattice(), expected) < 5e-6
     assert literal.relative(scan.direct(), expected) < 5e-6
-    assert torch.equal(scan.direct(block=1000), scan.direct(block=7)) or literal.relative(scan.direct(1000), scan.direct(7)) < 1e-6
+    assert (
+        torch.equal(scan.direct(block=1000), scan.direct(block=7))
+        or literal.relative(scan.direct(1000), scan.direct(7)) < 1e-6
+    )
 
 
 def test_no_circular_wrap_around():
@@ -146,7 +167,16 @@ def test_no_circular_wrap_around():
 
 
 def test_next_fast_length():
-    assert [next_fast_length(n) for n in (1, 7, 11, 13, 127, 128, 129, 143)] == [1, 8, 12, 15, 128, 128, 135, 144]
+    assert [next_fast_length(n) for n in (1, 7, 11, 13, 127, 128, 129, 143)] == [
+        1,
+        8,
+        12,
+        15,
+        128,
+        128,
+        135,
+        144,
+    ]
 
 
 def test_magnitude_gradient():

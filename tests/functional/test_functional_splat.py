@@ -15,7 +15,9 @@ def splat(times, sigma, normalise=True, bins=40):
     """One path of energy 1 per row."""
     times = torch.as_tensor(times, dtype=torch.float64)
     rows = torch.arange(len(times))
-    return gaussian_splat(torch.ones(len(times), dtype=torch.float64), times, rows, len(times), bins, sigma, normalise)
+    return gaussian_splat(
+        torch.ones(len(times), dtype=torch.float64), times, rows, len(times), bins, sigma, normalise
+    )
 
 
 def test_by_hand():
@@ -72,7 +74,9 @@ def test_paths_leave_the_window_without_reaching_other_spots():
 
 @pytest.mark.parametrize("sigma", [0.02, 0.005])
 def test_a_very_narrow_gaussian_falls_into_the_nearest_bin(sigma):
-    found = gaussian_splat(torch.tensor([2.0, 3.0]), torch.tensor([5.01, 6.9]), torch.tensor([0, 0]), 1, 10, sigma)
+    found = gaussian_splat(
+        torch.tensor([2.0, 3.0]), torch.tensor([5.01, 6.9]), torch.tensor([0, 0]), 1, 10, sigma
+    )
     assert torch.allclose(found[0, 5:7], torch.tensor([2.0, 3.0]), atol=1e-6)
 
 
@@ -82,4 +86,6 @@ def test_gradients():
     time = (torch.rand(6, dtype=torch.float64, generator=generator) * 12 - 1).requires_grad_()
     spot = torch.tensor([0, 1, 1, 0, 2, 1])
     for normalise in (True, False):
-        assert torch.autograd.gradcheck(lambda e, t, n=normalise: gaussian_splat(e, t, spot, 3, 10, 0.62, n), (energy, time))
+        assert torch.autograd.gradcheck(
+            lambda e, t, n=normalise: gaussian_splat(e, t, spot, 3, 10, 0.62, n), (energy, time)
+        )

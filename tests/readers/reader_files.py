@@ -22,7 +22,9 @@ def matlab73(path: Path, arrays: dict[str, np.ndarray]) -> Path:
     """As MATLAB saves with -v7.3: a user block with its text, axes reversed, the class as an attribute."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in arrays.items():
-            dataset = file.create_dataset(name, data=np.asarray(values).T, compression="gzip" if np.ndim(values) > 1 else None)
+            dataset = file.create_dataset(
+                name, data=np.asarray(values).T, compression="gzip" if np.ndim(values) > 1 else None
+            )
             dataset.attrs["MATLAB_class"] = np.bytes_("double")
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
@@ -69,7 +71,11 @@ def zaragoza(folder: Path, exhaustive: bool = False, reverse: bool = False) -> P
     points = np.stack([*np.broadcast_arrays(x[None, :], 0.0, z[:, None])])
     laser = np.array([[[0.0, 0.4]], [[0.0, 0.0]], [[0.0, 0.0]]])
     normals = np.broadcast_to(np.array([0.0, -1.0, 0.0])[:, None, None], points.shape)
-    shape, at = ((1, 200, 2, 2, 3, 1, 2), (0, 150, 1, 1, 1, 0, 1)) if exhaustive else ((1, 200, 2, 2, 3), (0, 150, 1, 1, 1))
+    shape, at = (
+        ((1, 200, 2, 2, 3, 1, 2), (0, 150, 1, 1, 1, 0, 1))
+        if exhaustive
+        else ((1, 200, 2, 2, 3), (0, 150, 1, 1, 1))
+    )
     data = np.zeros(shape, dtype=np.float32)
     data[at] = BRIGHT
     arrays = {
@@ -111,7 +117,9 @@ def radiance(path: Path, picture: np.ndarray, run_length: bool) -> Path:
                 same = int(np.argmax(np.append(channel[at:] != channel[at], True)))
                 body += bytes((128 + same, channel[at]))
                 at += same
-    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + f"-Y {rows} +X {columns}\n".encode() + bytes(body))
+    path.write_bytes(
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n" + f"-Y {rows} +X {columns}\n".encode() + bytes(body)
+    )
     return path
 
 
@@ -162,13 +170,17 @@ def cid(folder: Path) -> Path:
     counts[:, 20:50] = 1
     counts[4, 33] = BRIGHT
     for name, values in (("C_i", points), ("C_d", np.tile([0, 2, 4], (6, 1))), ("sub_Sig", counts)):
-        scipy.io.savemat(folder / f"{name}.mat", {name: values.astype(float) if name != "sub_Sig" else counts})
+        scipy.io.savemat(
+            folder / f"{name}.mat", {name: values.astype(float) if name != "sub_Sig" else counts}
+        )
     return folder / "sub_Sig.mat"
 
 
 def ytal(folder: Path, **changes: object) -> Path:
     """3 × 2 confocal spots, x in (-0.2, 0, 0.2), y in (-0.1, 0.1), 0.01 m bins from 0.5 m; bright at x = 0.2, y = -0.1, bin 33."""
-    grid = np.stack(np.meshgrid([-0.2, 0.0, 0.2], [-0.1, 0.1], [0.0], indexing="ij"), axis=-1)[:, :, 0].astype(np.float32)
+    grid = np.stack(np.meshgrid([-0.2, 0.0, 0.2], [-0.1, 0.1], [0.0], indexing="ij"), axis=-1)[
+        :, :, 0
+    ].astype(np.float32)
     items = {
         "H": cube((60, 3, 2), (33, 2, 0), np.float32),
         "H_format": np.array([1], dtype=np.int32),

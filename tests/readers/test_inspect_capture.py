@@ -22,7 +22,18 @@ def test_every_format_is_told_and_drawn(tmp_path, capsys, name):
     told = capsys.readouterr().out
     fmt = read_capture(path).provenance["format"]
     assert told.startswith(f"format       {fmt} (")
-    for word in ("kind", "spots", "wall", "bins", "time", "gate", "counts", "direct pulse", "first return", "done"):
+    for word in (
+        "kind",
+        "spots",
+        "wall",
+        "bins",
+        "time",
+        "gate",
+        "counts",
+        "direct pulse",
+        "first return",
+        "done",
+    ):
         assert f"\n{word}" in told
     picture = tmp_path / "out" / f"{path.stem}_capture.png"
     assert picture.read_bytes()[:4] == b"\x89PNG"
@@ -33,7 +44,9 @@ def _lct(folder: Path, scene_bin: int = 1200) -> Path:
     mean = 3000 * np.exp(-bins / 40.0) + 60 * np.exp(-((bins - scene_bin) ** 2) / 200.0) + 0.2
     rng = np.random.default_rng(1)
     path = folder / "capture.mat"
-    scipy.io.savemat(path, {"rect_data": rng.poisson(np.broadcast_to(mean, (6, 6, 2048))).astype(np.uint16), "width": 0.35})
+    scipy.io.savemat(
+        path, {"rect_data": rng.poisson(np.broadcast_to(mean, (6, 6, 2048))).astype(np.uint16), "width": 0.35}
+    )
     return path
 
 
@@ -65,7 +78,10 @@ def test_what_looks_wrong_is_said(tmp_path, capsys, arguments, warning):
 
 def test_an_error_is_one_sentence_and_status_2(tmp_path):
     run = subprocess.run(
-        [sys.executable, "inspect_capture.py", str(tmp_path / "nothing.mat")], cwd=ROOT, capture_output=True, text=True
+        [sys.executable, "inspect_capture.py", str(tmp_path / "nothing.mat")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
     )
     assert run.returncode == 2
     assert run.stdout == ""

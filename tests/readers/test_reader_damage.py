@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from data_modules.readers import ReaderOptions, detect_format, read_capture
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 OPTIONS = {"tsai": ReaderOptions(bin_width_ps=10.0), "cube": ReaderOptions(bin_width_ps=10.0, wall_size=0.8)}
 QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -115,7 +115,9 @@ def test_no_file_and_folders(tmp_path):
 
 def test_wrong_keys_are_listed_beside_what_is_known(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"histogram": np.ones((3, 4, 5)), "bins": 5})
-    with pytest.raises(CaptureError, match=r"histogram 3×4×5, bins 1×1.*lct: rect_data \[nx, ny, T\] and width"):
+    with pytest.raises(
+        CaptureError, match=r"histogram 3×4×5, bins 1×1.*lct: rect_data \[nx, ny, T\] and width"
+    ):
         detect_format(tmp_path / "a.mat")
 
 
@@ -229,6 +231,8 @@ def test_impossible_options(values):
 def test_delays_that_leave_nothing(tmp_path):
     with pytest.raises(CaptureError, match="leave nothing"):
         read_capture(files.fk(tmp_path), options=ReaderOptions(bin_width_ps=0.5))
-    files.matlab73(tmp_path / "scene.mat", {"meas": files.cube((2, 4, 64), (1, 0, 40)), "tofgrid": np.zeros((3, 4))})
+    files.matlab73(
+        tmp_path / "scene.mat", {"meas": files.cube((2, 4, 64), (1, 0, 40)), "tofgrid": np.zeros((3, 4))}
+    )
     with pytest.raises(CaptureError, match="tofgrid"):
         read_capture(tmp_path / "scene.mat")

@@ -5,7 +5,7 @@ import pytest
 import reader_files as files
 
 from data_modules.readers import READERS, ReaderOptions, detect_format, read_capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 UNITS = ReaderOptions(bin_width_ps=10.0)
 CUBE = ReaderOptions(bin_width_ps=10.0, wall_size=0.8)
@@ -16,7 +16,19 @@ TABLE = [
     ("ytal", {}, None, "ytal", "confocal", (3, 2), (0.2, -0.1), (0.2, -0.1), 0.5 + 33.5 * 0.01, 0.01, 9),
     ("lct", {}, None, "lct", "confocal", (4, 2), (0.3, 0.2), (0.3, 0.2), 300.5 * C * 4e-12, C * 4e-12, 9),
     ("fk", {}, None, "fk", "confocal", (4, 2), (0.75, -0.5), (0.75, -0.5), 35.5 * C * 32e-12, C * 32e-12, 9),
-    ("fk", {"beside": True}, None, "fk", "confocal", (4, 2), (0.75, -0.5), (0.75, -0.5), 35.5 * C * 32e-12, C * 32e-12, 9),
+    (
+        "fk",
+        {"beside": True},
+        None,
+        "fk",
+        "confocal",
+        (4, 2),
+        (0.75, -0.5),
+        (0.75, -0.5),
+        35.5 * C * 32e-12,
+        C * 32e-12,
+        9,
+    ),
     (
         "phasor_field",
         {},
@@ -31,15 +43,99 @@ TABLE = [
         9,
     ),
     ("zaragoza", {}, None, "zaragoza", "confocal", (3, 2), (0.0, 0.4), (0.0, 0.4), 0.505, 0.01, 9),
-    ("zaragoza", {"reverse": True}, None, "zaragoza", "confocal", (3, 2), (0.0, 0.4), (0.0, 0.4), 0.505, 0.01, 9),
-    ("zaragoza", {"exhaustive": True}, None, "zaragoza", "exhaustive", (2, 1, 3, 2), (0.4, 0.0), (0.0, 0.4), 0.505, 0.01, 9),
+    (
+        "zaragoza",
+        {"reverse": True},
+        None,
+        "zaragoza",
+        "confocal",
+        (3, 2),
+        (0.0, 0.4),
+        (0.0, 0.4),
+        0.505,
+        0.01,
+        9,
+    ),
+    (
+        "zaragoza",
+        {"exhaustive": True},
+        None,
+        "zaragoza",
+        "exhaustive",
+        (2, 1, 3, 2),
+        (0.4, 0.0),
+        (0.0, 0.4),
+        0.505,
+        0.01,
+        9,
+    ),
     ("chen", {}, None, "chen", "confocal", (8, 8), (0.625, 0.375), (0.625, 0.375), 0.045, 0.01, 0.5),
-    ("chen", {"run_length": False}, None, "chen", "confocal", (8, 8), (0.625, 0.375), (0.625, 0.375), 0.045, 0.01, 0.5),
+    (
+        "chen",
+        {"run_length": False},
+        None,
+        "chen",
+        "confocal",
+        (8, 8),
+        (0.625, 0.375),
+        (0.625, 0.375),
+        0.045,
+        0.01,
+        0.5,
+    ),
     ("ahn", {}, None, "tsai_ahn", "confocal", (2, 2), (-0.1, -0.2), (-0.1, -0.2), 33.5 * 0.002, 0.002, 9),
-    ("ahn", {"confocal": False}, None, "tsai_ahn", "single_sensor", (2, 2), (-0.1, -0.2), (-0.3, 0.1), 33.5 * 0.002, 0.002, 9),
-    ("tsai", {}, UNITS, "tsai_ahn", "confocal", (2, 3), (0.2, -0.1), (0.2, -0.1), 33.5 * C * 1e-11, C * 1e-11, 9),
-    ("cube", {}, CUBE, "tsai_ahn", "confocal", (4, 2), (-0.3, 0.2), (-0.3, 0.2), 33.5 * C * 1e-11, C * 1e-11, 9),
-    ("cid", {}, None, "cid", "single_sensor", (3, 2), (0.02, 0.01), (0.0, -0.01), 33.5 * C * 16e-12, C * 16e-12, 9),
+    (
+        "ahn",
+        {"confocal": False},
+        None,
+        "tsai_ahn",
+        "single_sensor",
+        (2, 2),
+        (-0.1, -0.2),
+        (-0.3, 0.1),
+        33.5 * 0.002,
+        0.002,
+        9,
+    ),
+    (
+        "tsai",
+        {},
+        UNITS,
+        "tsai_ahn",
+        "confocal",
+        (2, 3),
+        (0.2, -0.1),
+        (0.2, -0.1),
+        33.5 * C * 1e-11,
+        C * 1e-11,
+        9,
+    ),
+    (
+        "cube",
+        {},
+        CUBE,
+        "tsai_ahn",
+        "confocal",
+        (4, 2),
+        (-0.3, 0.2),
+        (-0.3, 0.2),
+        33.5 * C * 1e-11,
+        C * 1e-11,
+        9,
+    ),
+    (
+        "cid",
+        {},
+        None,
+        "cid",
+        "single_sensor",
+        (3, 2),
+        (0.02, 0.01),
+        (0.0, -0.01),
+        33.5 * C * 16e-12,
+        C * 16e-12,
+        9,
+    ),
 ]
 
 
@@ -54,7 +150,9 @@ def test_the_bright_bin_lies_where_the_format_says(tmp_path, row):
     assert (capture.counts == value).sum() == 1
     np.testing.assert_allclose(capture.laser[spot], (*laser, 0.0), atol=1e-7)
     np.testing.assert_allclose(capture.sensor[spot], (*sensor, 0.0), atol=1e-7)
-    np.testing.assert_allclose(capture.laser_normal, np.tile([0.0, 0.0, 1.0], (capture.n_spots, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        capture.laser_normal, np.tile([0.0, 0.0, 1.0], (capture.n_spots, 1)), atol=1e-12
+    )
     assert capture.bin_length == pytest.approx(length, rel=1e-9)
     tolerance = {"zaragoza": 0.5, "fk": 1e-6}.get(fmt, 1e-6) * length  # whole bins of delay are taken off
     assert capture.t_start + (bin_ + 0.5) * capture.bin_length == pytest.approx(path, abs=tolerance)
@@ -62,14 +160,25 @@ def test_the_bright_bin_lies_where_the_format_says(tmp_path, row):
     assert capture.scan_shape == scan
     assert capture.provenance["format"] == fmt
     assert capture.is_counts == (fmt in ("lct", "fk", "phasor_field", "tsai_ahn", "cid"))
-    grid = (capture.laser if np.ptp(capture.laser) > 0 else capture.sensor)[: int(np.prod(scan))].reshape(*scan, 3)
+    grid = (capture.laser if np.ptp(capture.laser) > 0 else capture.sensor)[: int(np.prod(scan))].reshape(
+        *scan, 3
+    )
     if len(scan) == 2:
         assert (np.diff(grid[..., 0], axis=0) > 0).all()
         assert (np.diff(grid[..., 1], axis=1) > 0).all()
 
 
 def test_every_reader_says_what_it_is():
-    assert [reader.NAME for reader in READERS] == ["ytal", "lct", "fk", "phasor_field", "zaragoza", "chen", "tsai_ahn", "cid"]
+    assert [reader.NAME for reader in READERS] == [
+        "ytal",
+        "lct",
+        "fk",
+        "phasor_field",
+        "zaragoza",
+        "chen",
+        "tsai_ahn",
+        "cid",
+    ]
     for reader in READERS:
         assert "\n" not in reader.DESCRIPTION
         assert reader.NAME not in ("", "auto")
@@ -106,7 +215,14 @@ def test_scan_order_is_over_the_files_own_axes(tmp_path):
 def test_options_move_what_they_name(tmp_path):
     file = files.lct(tmp_path)
     options = ReaderOptions(
-        bin_width_ps=8.0, wall_size=(1.6, 0.4), t_start=0.1, gate=(5, 390), flip_x=True, flip_y=True, swap_xy=True, exposure_s=2.5
+        bin_width_ps=8.0,
+        wall_size=(1.6, 0.4),
+        t_start=0.1,
+        gate=(5, 390),
+        flip_x=True,
+        flip_y=True,
+        swap_xy=True,
+        exposure_s=2.5,
     )
     capture = read_capture(file, options=options)
     spot, bin_ = np.unravel_index(np.argmax(capture.counts), capture.counts.shape)

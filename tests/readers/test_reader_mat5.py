@@ -9,7 +9,7 @@ import scipy.io
 
 from data_modules.readers import read_capture
 from data_modules.readers.contents import open_contents
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
 TYPES = ["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8"]
 
@@ -56,7 +56,9 @@ def test_structs_are_listed_and_the_rest_is_never_decoded(tmp_path, packed):
 def test_a_flipped_bit_in_packed_data_is_noticed(tmp_path):
     path = tmp_path / "a.mat"
     scipy.io.savemat(
-        path, {"rect_data": np.random.default_rng(0).integers(0, 9, (8, 8, 64)).astype("u2"), "width": 0.3}, do_compression=True
+        path,
+        {"rect_data": np.random.default_rng(0).integers(0, 9, (8, 8, 64)).astype("u2"), "width": 0.3},
+        do_compression=True,
     )
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 16

@@ -50,7 +50,9 @@ def test_tals_raw_scale_is_taken_off():
     raw, capture = read_capture(path, options=ReaderOptions(raw_scale=False)), read_capture(path)
     ratio = raw.counts.sum(axis=1) / capture.counts.sum(axis=1)
     # laser at (-0.5, 0, 0.25): nearest spots (-0.4375, ±0.0625) and (-0.5625, ±0.0625), furthest the corners at x = 0.9375
-    near, far = (np.pi * 0.25 / (dx**2 + dy**2 + 0.0625) ** 1.5 for dx, dy in ((0.0625, 0.0625), (1.4375, 0.9375)))
+    near, far = (
+        np.pi * 0.25 / (dx**2 + dy**2 + 0.0625) ** 1.5 for dx, dy in ((0.0625, 0.0625), (1.4375, 0.9375))
+    )
     assert ratio.max() == pytest.approx(near, rel=1e-4)
     assert ratio.min() == pytest.approx(far, rel=1e-4)
     assert near / far == pytest.approx(280, abs=1)
@@ -68,7 +70,12 @@ def test_lct_captures(name, sha):
     capture = read_capture(path)
     assert hashlib.sha256(path.read_bytes()).hexdigest() == sha
     assert capture.provenance["format"] == "lct"
-    assert (capture.kind, capture.scan_shape, capture.n_bins, capture.counts.dtype) == ("confocal", (64, 64), 2048, np.uint16)
+    assert (capture.kind, capture.scan_shape, capture.n_bins, capture.counts.dtype) == (
+        "confocal",
+        (64, 64),
+        2048,
+        np.uint16,
+    )
     assert capture.bin_length == pytest.approx(C * 4e-12)
     assert capture.laser[:, :2].min() == pytest.approx(-0.35 * 63 / 64)
     assert 560 <= capture.gate[0] <= 720
@@ -89,10 +96,14 @@ def _image(capture, depth: float, step: int, wavelength: float = 0.06) -> np.nda
     counts[:, :first] = 0
     wave = 2 * np.pi * np.fft.fftfreq(capture.n_bins, capture.bin_length)
     filtered = np.fft.ifft(
-        np.fft.fft(counts, axis=1) * np.exp(-((wave - 2 * np.pi / wavelength) ** 2) * (wavelength / 2) ** 2 / 2), axis=1
+        np.fft.fft(counts, axis=1)
+        * np.exp(-((wave - 2 * np.pi / wavelength) ** 2) * (wavelength / 2) ** 2 / 2),
+        axis=1,
     )
     side = np.abs(capture.laser[:, :2]).max() * np.linspace(-1, 1, 28)
-    voxels = np.stack([*np.meshgrid(side, side, indexing="ij"), np.full((28, 28), depth)], axis=-1).reshape(-1, 3)
+    voxels = np.stack([*np.meshgrid(side, side, indexing="ij"), np.full((28, 28), depth)], axis=-1).reshape(
+        -1, 3
+    )
     image = np.zeros(len(voxels), dtype=complex)
     for spot, transient in zip(rows, filtered, strict=True):
         path = sum(np.linalg.norm(voxels - point[spot], axis=1) for point in (capture.laser, capture.sensor))
@@ -138,15 +149,23 @@ def test_figure_4_reads_as_4_from_the_wall():
     assert "100 of 4096 spots hold no counts at all" in capture.provenance["steps"]
     assert "1000 spots hold nothing before bin 420" in capture.provenance["steps"]
     seen = np.max([_seen(_image(capture, depth, 2, 0.08)) for depth in np.arange(0.88, 1.04, 0.02)], axis=0)
-    assert _ratio(seen, np.s_[17:21, 11:14], np.s_[17:21, 4:7]) > 1.5  # the tail at the right, nothing at the lower left
+    assert (
+        _ratio(seen, np.s_[17:21, 11:14], np.s_[17:21, 4:7]) > 1.5
+    )  # the tail at the right, nothing at the lower left
     assert _ratio(seen, np.s_[8:11, 4:7], np.s_[17:21, 4:7]) > 1.5  # the arm at the upper left
 
 
-@pytest.mark.parametrize("name", ["measured/data_s_u.mat", "measured/figure_4", "rendered/z_exhaustive_8x8x8x8_d3.hdf5"])
+@pytest.mark.parametrize(
+    "name", ["measured/data_s_u.mat", "measured/figure_4", "rendered/z_exhaustive_8x8x8x8_d3.hdf5"]
+)
 def test_real_captures_survive_a_round_trip(tmp_path, name):
     capture = read_capture(real_file(name))
     back = read_capture(write_capture(tmp_path / "a.hdf5", capture))
     np.testing.assert_array_equal(back.counts, capture.counts)
     np.testing.assert_array_equal(back.laser, capture.laser)
     np.testing.assert_array_equal(back.scan_order, capture.scan_order)
-    assert (back.gate, back.provenance, back.counts.dtype) == (capture.gate, capture.provenance, capture.counts.dtype)
+    assert (back.gate, back.provenance, back.counts.dtype) == (
+        capture.gate,
+        capture.provenance,
+        capture.counts.dtype,
+    )

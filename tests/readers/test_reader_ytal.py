@@ -10,15 +10,27 @@ import reader_files as files
 
 from data_modules.readers import ReaderOptions, read_capture, write_capture
 from nlos_lit.capture import Capture
-from nlos_lit.errors import CaptureError
+from nlos_lit.capture.errors import CaptureError
 
-TAL_KEYS = {"H", "H_format", "delta_t", "t_start", "t_accounts_first_and_last_bounces", "scene_info", "volume_format"} | {
-    f"{device}_{part}" for device in ("laser", "sensor") for part in ("xyz", "grid_xyz", "grid_normals", "grid_format")
+TAL_KEYS = {
+    "H",
+    "H_format",
+    "delta_t",
+    "t_start",
+    "t_accounts_first_and_last_bounces",
+    "scene_info",
+    "volume_format",
+} | {
+    f"{device}_{part}"
+    for device in ("laser", "sensor")
+    for part in ("xyz", "grid_xyz", "grid_normals", "grid_format")
 }
 
 
 def _grid(nx: int, ny: int, offset: float = 0.0) -> np.ndarray:
-    x, y = np.meshgrid(0.1 * np.arange(nx) - 0.123456789 + offset, 0.07 * np.arange(ny) + offset / 3, indexing="ij")
+    x, y = np.meshgrid(
+        0.1 * np.arange(nx) - 0.123456789 + offset, 0.07 * np.arange(ny) + offset / 3, indexing="ij"
+    )
     return np.stack([x.ravel(), y.ravel(), 0.001 * np.arange(nx * ny)], axis=1)
 
 
@@ -114,7 +126,9 @@ def test_nothing_is_overwritten_or_left_behind(tmp_path):
     write_capture(path, _capture("exhaustive"), overwrite=True)
     assert read_capture(path).kind == "exhaustive"
     with pytest.raises(CaptureError, match="JSON"):
-        write_capture(tmp_path / "b.hdf5", dataclasses.replace(_capture("confocal"), provenance={"bad": {1, 2}}))
+        write_capture(
+            tmp_path / "b.hdf5", dataclasses.replace(_capture("confocal"), provenance={"bad": {1, 2}})
+        )
     with pytest.raises(CaptureError, match="cannot write"):
         write_capture(tmp_path / "no_folder" / "b.hdf5", _capture("confocal"))
     assert [file.name for file in tmp_path.iterdir()] == ["a.hdf5"]
@@ -162,7 +176,11 @@ def test_first_and_last_way_are_taken_off_by_whole_bins(tmp_path):
     values[130, 1, 0] = 7  # path 1.3 + half a bin, less 0.6
     normals = np.broadcast_to(np.array([0.0, 0.0, 1.0]), grid.shape)
     changes = {"H": values, "t_start": 0.0, "t_accounts_first_and_last_bounces": np.bool_(True)}
-    changes |= {f"{name}_grid_{part}": v for name in ("laser", "sensor") for part, v in (("xyz", grid), ("normals", normals))}
+    changes |= {
+        f"{name}_grid_{part}": v
+        for name in ("laser", "sensor")
+        for part, v in (("xyz", grid), ("normals", normals))
+    }
     capture = read_capture(files.ytal(tmp_path, **changes))
     assert capture.n_bins == 100
     for value, path, x in ((9, 0.305, 0.4), (7, 0.705, 0.0)):
@@ -174,7 +192,9 @@ def test_first_and_last_way_are_taken_off_by_whole_bins(tmp_path):
 
 def test_rounding_of_the_first_and_last_way_is_told_and_small(tmp_path):
     values = files.cube((120, 3, 2), (90, 2, 0), np.float32)
-    path = files.ytal(tmp_path, H=values, t_accounts_first_and_last_bounces=np.bool_(True), t_start=0.0, delta_t=0.013)
+    path = files.ytal(
+        tmp_path, H=values, t_accounts_first_and_last_bounces=np.bool_(True), t_start=0.0, delta_t=0.013
+    )
     capture = read_capture(path)
     bin_ = np.argwhere(capture.counts == files.BRIGHT)[0, 1]
     way = 2 * np.linalg.norm([0.2, -0.1, -0.3])
@@ -216,9 +236,15 @@ def test_huge_scene_info_with_python_tags_is_not_parsed(tmp_path):
 
 def test_a_wall_that_faces_elsewhere_is_turned(tmp_path):
     # wall in the plane x = 0 facing +x, y up: seen from the wall the file's -z is to the left, which is our +x
-    grid = np.stack(np.meshgrid([0.0], [-0.1, 0.1], [-0.2, 0.0, 0.2], indexing="ij"), axis=-1)[0].astype(np.float32)
+    grid = np.stack(np.meshgrid([0.0], [-0.1, 0.1], [-0.2, 0.0, 0.2], indexing="ij"), axis=-1)[0].astype(
+        np.float32
+    )
     normals = np.broadcast_to(np.array([1.0, 0.0, 0.0]), grid.shape)
-    changes = {f"{name}_grid_{part}": v for name in ("laser", "sensor") for part, v in (("xyz", grid), ("normals", normals))}
+    changes = {
+        f"{name}_grid_{part}": v
+        for name in ("laser", "sensor")
+        for part, v in (("xyz", grid), ("normals", normals))
+    }
     capture = read_capture(files.ytal(tmp_path, H=files.cube((60, 2, 3), (33, 0, 2), np.float32), **changes))
     spot = int(np.argmax(capture.counts.max(axis=1)))
     np.testing.assert_allclose(capture.laser[spot], (-0.2, -0.1, 0.0), atol=1e-7)
@@ -229,9 +255,19 @@ def test_a_wall_that_faces_elsewhere_is_turned(tmp_path):
 def test_irregular_spots(tmp_path):
     rng = np.random.default_rng(0)
     laser, sensor = rng.random((2, 3)), rng.random((4, 3))
-    normals = {f"{name}_grid_normals": np.tile([0, 0, 1], (len(p), 1)) for name, p in (("laser", laser), ("sensor", sensor))}
+    normals = {
+        f"{name}_grid_normals": np.tile([0, 0, 1], (len(p), 1))
+        for name, p in (("laser", laser), ("sensor", sensor))
+    }
     values = rng.random((60, 2, 4)).astype(np.float32)
-    path = files.ytal(tmp_path, H=values, H_format=np.array([4], np.int32), laser_grid_xyz=laser, sensor_grid_xyz=sensor, **normals)
+    path = files.ytal(
+        tmp_path,
+        H=values,
+        H_format=np.array([4], np.int32),
+        laser_grid_xyz=laser,
+        sensor_grid_xyz=sensor,
+        **normals,
+    )
     capture = read_capture(path)
     assert (capture.kind, capture.scan_shape, capture.n_spots) == ("irregular", None, 8)
     np.testing.assert_array_equal(capture.counts[4 + 3], values[:, 1, 3])

@@ -10,11 +10,11 @@ import pytest
 
 from data_modules.simulate.capture import simulate_capture
 from data_modules.simulate.mesh import Mesh, load_mesh
-from data_modules.simulate.scan import ScanPlan, wall_grid
+from data_modules.simulate.plan import ScanPlan, wall_grid
 from data_modules.simulate.scenes import bunny_two_albedo, default_scene, letters, plate, sphere, strokes
 from data_modules.simulate.sensor import SensorModel
 from data_modules.simulate.truth import load_truth, save_truth, view_from_wall
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 SCAN = ScanPlan(nx=4, ny=3, width=0.8, height=0.6, bin_length=0.01, n_bins=200)
 QUIET = SensorModel(sigma=0.01, kappa=60.0, background=0.0, mean_counts=1000.0)
@@ -55,7 +55,9 @@ def test_the_brightest_and_earliest_spot_is_the_one_before_the_object():
     cube = capture.counts.reshape(4, 3, -1)
     assert np.unravel_index(cube.sum(axis=2).argmax(), (4, 3)) == (3, 0)
     assert cube[3, 0].argmax() in (79, 80, 81)
-    assert (cube[0, 2].argmax() - 0.5) * 0.01 == pytest.approx(2 * np.sqrt(0.6**2 + 0.4**2 + 0.4**2), abs=0.03)
+    assert (cube[0, 2].argmax() - 0.5) * 0.01 == pytest.approx(
+        2 * np.sqrt(0.6**2 + 0.4**2 + 0.4**2), abs=0.03
+    )
 
 
 def test_exposure_sets_the_mean_counts_and_background_adds_to_every_bin():
@@ -91,7 +93,12 @@ def test_light_from_before_the_window_still_smears_into_it(caplog):
 
 def test_a_window_that_misses_the_scene_says_so():
     with pytest.raises(UserError, match="no light of the scene arrives between 5 and 7 m"):
-        simulate_capture(plate((0, 0, 0.5), 0.2, 0.2), ScanPlan(nx=2, ny=2, bin_length=0.01, n_bins=200, t_start=5.0), QUIET, 0)
+        simulate_capture(
+            plate((0, 0, 0.5), 0.2, 0.2),
+            ScanPlan(nx=2, ny=2, bin_length=0.01, n_bins=200, t_start=5.0),
+            QUIET,
+            0,
+        )
 
 
 def test_the_direct_pulse_lies_before_the_gate():
@@ -105,7 +112,9 @@ def test_the_direct_pulse_lies_before_the_gate():
         simulate_capture(plate((0, 0, 0.5), 0.2, 0.2), ScanPlan(kind="single", nx=2, ny=2), sensor, 0)
 
 
-@pytest.mark.parametrize("bad", [{"kind": "spiral"}, {"fixed": "mirror"}, {"nx": 0}, {"bin_length": 0.0}, {"height": -1.0}])
+@pytest.mark.parametrize(
+    "bad", [{"kind": "spiral"}, {"fixed": "mirror"}, {"nx": 0}, {"bin_length": 0.0}, {"height": -1.0}]
+)
 def test_impossible_scans_are_refused(bad):
     with pytest.raises(UserError):
         ScanPlan(**bad)
@@ -129,7 +138,9 @@ def test_truth_is_what_lies_along_z_first():
 
 def test_backs_are_seen_black_with_the_normal_towards_the_wall():
     back = plate((0, 0, 0.5), 0.2, 0.2, turn_y=0.3, albedo=0.7).flipped()
-    one, two = (view_from_wall(back, np.array([0.0]), np.array([0.0]), two_sided=both) for both in (False, True))
+    one, two = (
+        view_from_wall(back, np.array([0.0]), np.array([0.0]), two_sided=both) for both in (False, True)
+    )
     assert one.albedo[0, 0] == 0
     assert two.albedo[0, 0] == pytest.approx(0.7)
     assert one.normal[0, 0] == pytest.approx([-np.sin(0.3), 0, -np.cos(0.3)], abs=1e-9)
@@ -163,7 +174,9 @@ def test_meshes_face_the_wall_and_close_where_they_should():
     assert plate((0, 0, 1), 0.1, 0.2).area == pytest.approx(0.02)
     assert (letters().face_vectors[:, 2] < 0).all()
     ball = sphere((0.1, 0.2, 0.9), 0.3, rings=40)
-    volume = (ball.corners.mean(axis=1) * ball.face_vectors).sum() / 3  # divergence theorem: positive when normals point out
+    volume = (
+        ball.corners.mean(axis=1) * ball.face_vectors
+    ).sum() / 3  # divergence theorem: positive when normals point out
     assert volume == pytest.approx(4 / 3 * np.pi * 0.3**3, rel=0.01)
     bar = strokes([np.array([[0.0, 0.0], [0.2, 0.0]])], depth=0.5, stroke=0.1, bevel=0.02, cell=0.01)
     assert bar.vertices[:, 2].min() == 0.5

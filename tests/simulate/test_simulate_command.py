@@ -12,10 +12,12 @@ import pytest
 
 from data_modules.readers import read_capture
 from data_modules.simulate import load_truth
-from nlos_lit.errors import UserError
+from nlos_lit.capture.errors import UserError
 
 # By its path: this folder has the same name.
-_SPEC = importlib.util.spec_from_file_location("simulate_command", Path(__file__).resolve().parents[2] / "simulate.py")
+_SPEC = importlib.util.spec_from_file_location(
+    "simulate_command", Path(__file__).resolve().parents[2] / "simulate.py"
+)
 simulate = importlib.util.module_from_spec(_SPEC)
 sys.modules["simulate_command"] = simulate
 _SPEC.loader.exec_module(simulate)
@@ -40,7 +42,14 @@ def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
     out = tmp_path / "x.hdf5"
     small = [*SMALL, "sigma=0.02", "scene=letters", "seed=1"]
     simulate.main(
-        [f"out={out}", "effects=[pile_up,hot_spots]", "pile_up.detections=0.4", "hot_spots.level=2", "exposure=3", *small]
+        [
+            f"out={out}",
+            "effects=[pile_up,hot_spots]",
+            "pile_up.detections=0.4",
+            "hot_spots.level=2",
+            "exposure=3",
+            *small,
+        ]
     )
     capture = read_capture(out)
     told = capture.provenance["effects"]

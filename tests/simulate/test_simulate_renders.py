@@ -25,7 +25,9 @@ RENDERS = [
 
 
 def scene(name: str):
-    return sphere_before_plate() if name == "sphereplate" else load_mesh(real_file(f"rendered/{name}_mesh.obj"))
+    return (
+        sphere_before_plate() if name == "sphereplate" else load_mesh(real_file(f"rendered/{name}_mesh.obj"))
+    )
 
 
 def read_render(name: str, step: int):
@@ -46,7 +48,9 @@ def read_render(name: str, step: int):
 def test_agrees_with_an_independent_render_at_its_noise(name, mesh, step):
     render, laser, sensor, bin_length, noise = read_render(name, step)
     normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
-    ours = simulate_transients(scene(mesh), laser, sensor, normals, normals, bin_length=bin_length, n_bins=render.shape[1])
+    ours = simulate_transients(
+        scene(mesh), laser, sensor, normals, normals, bin_length=bin_length, n_bins=render.shape[1]
+    )
     assert np.linalg.norm(render - ours) < 1.1 * noise * np.linalg.norm(render)
     assert (render * ours).sum() / (ours**2).sum() == pytest.approx(1, abs=0.01)
     assert render.sum() == pytest.approx(ours.sum(), rel=0.006)
@@ -59,7 +63,13 @@ def test_a_transposed_scan_would_be_noticed():
     render, laser, sensor, bin_length, noise = read_render("bunny_single_32_d3", 29)
     normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
     ours = simulate_transients(
-        scene("bunny"), laser, sensor[:, [1, 0, 2]], normals, normals, bin_length=bin_length, n_bins=render.shape[1]
+        scene("bunny"),
+        laser,
+        sensor[:, [1, 0, 2]],
+        normals,
+        normals,
+        bin_length=bin_length,
+        n_bins=render.shape[1],
     )
     assert np.linalg.norm(render - ours) > 3 * noise * np.linalg.norm(render)
 

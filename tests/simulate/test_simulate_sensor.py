@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import exponnorm
 
-from data_modules.simulate.sensor import SensorModel, direct_pulse, draw_counts, respond, response_cdf, response_kernel
-from nlos_lit.errors import UserError
+from data_modules.simulate.sensor import (
+    SensorModel,
+    direct_pulse,
+    draw_counts,
+    respond,
+    response_cdf,
+    response_kernel,
+)
+from nlos_lit.capture.errors import UserError
 
 
 def moments(sigma, kappa, b):
@@ -53,8 +60,12 @@ def test_extreme_responses_stay_finite_and_monotonic(sigma, kappa):
 
 def test_limits_are_a_pure_gaussian_a_pure_exponential_and_nothing():
     t = np.array([-0.02, 0.0, 0.013, 0.05])
-    assert response_cdf(t, 0.01, np.inf) == pytest.approx([0.5 * math.erfc(-v / 0.01 / math.sqrt(2)) for v in t], abs=1e-15)
-    assert response_cdf(t, 0.0, 60.0) == pytest.approx([0, 0, 1 - math.exp(-0.78), 1 - math.exp(-3)], abs=1e-15)
+    assert response_cdf(t, 0.01, np.inf) == pytest.approx(
+        [0.5 * math.erfc(-v / 0.01 / math.sqrt(2)) for v in t], abs=1e-15
+    )
+    assert response_cdf(t, 0.0, 60.0) == pytest.approx(
+        [0, 0, 1 - math.exp(-0.78), 1 - math.exp(-3)], abs=1e-15
+    )
     assert response_cdf(t, 0.01, 1e7) == pytest.approx(response_cdf(t, 0.01, np.inf), abs=1e-4)
     assert response_cdf(t, 1e-8, 60.0) == pytest.approx(response_cdf(t, 0.0, 60.0), abs=1e-3)
     h = np.array([[0.0, 3.0, 1.0, 0.0, 7.0]])
@@ -91,7 +102,9 @@ def test_counts_have_poisson_mean_and_variance_and_repeat_with_their_seed():
     assert (np.abs(counts.var(axis=0) - mean) < 4 * np.sqrt((2 * mean**2 + mean) / n)).all()
 
 
-@pytest.mark.parametrize("bad", [{"sigma": -1.0}, {"kappa": 0.0}, {"mean_counts": 0.0}, {"background": -0.1}, {"sigma": np.nan}])
+@pytest.mark.parametrize(
+    "bad", [{"sigma": -1.0}, {"kappa": 0.0}, {"mean_counts": 0.0}, {"background": -0.1}, {"sigma": np.nan}]
+)
 def test_impossible_sensors_are_refused(bad):
     with pytest.raises(UserError, match="sigma"):
         SensorModel(**bad)

@@ -11,15 +11,19 @@ import pytest
 from data_modules.simulate.mesh import Mesh, join
 from data_modules.simulate.scenes import plate, sphere
 from data_modules.simulate.transients import simulate_transients, spread_triangles, work
-from nlos_lit.errors import CaptureError, MemoryBudgetError, UserError
+from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError
 
 WALL = (0.0, 0.0, 1.0)
 
 
 def transients(mesh: Mesh, laser, sensor, *, bin_length=0.01, n_bins=400, **options) -> np.ndarray:
-    laser, sensor = np.broadcast_arrays(np.atleast_2d(laser).astype(float), np.atleast_2d(sensor).astype(float))
+    laser, sensor = np.broadcast_arrays(
+        np.atleast_2d(laser).astype(float), np.atleast_2d(sensor).astype(float)
+    )
     normals = np.broadcast_to(WALL, laser.shape)
-    return simulate_transients(mesh, laser, sensor, normals, normals, bin_length=bin_length, n_bins=n_bins, **options)
+    return simulate_transients(
+        mesh, laser, sensor, normals, normals, bin_length=bin_length, n_bins=n_bins, **options
+    )
 
 
 def test_one_small_patch_has_the_value_and_bin_of_the_formula():
@@ -48,7 +52,9 @@ def test_tilted_wall_uses_the_wall_normal():
     zero = np.zeros((1, 3))
     mesh = plate((0, 0, 0.7), 0.004, 0.004)
     flat = transients(mesh, zero, zero).sum()
-    turned = simulate_transients(mesh, zero, zero, tilted, np.array([WALL]), bin_length=0.01, n_bins=400).sum()
+    turned = simulate_transients(
+        mesh, zero, zero, tilted, np.array([WALL]), bin_length=0.01, n_bins=400
+    ).sum()
     assert turned / flat == pytest.approx(math.cos(0.4), rel=1e-4)
 
 
@@ -102,7 +108,9 @@ def test_sphere_agrees_with_its_one_dimensional_integral():
 
 def test_finer_patches_change_little():
     spots = np.array([[0.3, 0.1, 0], [-0.2, -0.4, 0]])
-    mesh = join(plate((0.2, 0.1, 0.7), 0.4, 0.3, turn_x=0.5, albedo=0.4), sphere((-0.1, 0, 0.5), 0.15, rings=12))
+    mesh = join(
+        plate((0.2, 0.1, 0.7), 0.4, 0.3, turn_x=0.5, albedo=0.4), sphere((-0.1, 0, 0.5), 0.15, rings=12)
+    )
     coarse, fine = (transients(mesh, spots, spots, detail=detail) for detail in (1, 3))
     assert np.linalg.norm(coarse - fine) < 0.01 * np.linalg.norm(fine)
     assert coarse.sum(axis=1) == pytest.approx(fine.sum(axis=1), rel=0.01)
@@ -112,7 +120,9 @@ def test_albedo_is_linear_across_a_face():
     shade = plate((0, 0, 0.8), 0.02, 0.02)
     ramp = Mesh(shade.vertices, shade.faces, [0.2, 0.2, 0.8, 0.8])
     point = (0, 0, 0)
-    assert transients(ramp, point, point).sum() == pytest.approx(0.5 * transients(shade, point, point).sum(), rel=1e-3)
+    assert transients(ramp, point, point).sum() == pytest.approx(
+        0.5 * transients(shade, point, point).sum(), rel=1e-3
+    )
 
 
 def test_a_plate_fully_behind_another_gives_nothing():
@@ -194,7 +204,10 @@ def test_exhaustive_pairs_equal_pairs_one_by_one():
 @pytest.mark.parametrize(
     ("times", "expected"),
     [
-        ((0.25, 1.5, 2.75), [0, 0.18, 0.64, 0.18, 0]),  # survival at 1: 1 - 0.75²/(2.5·1.25) = 0.82, at 2: 0.18
+        (
+            (0.25, 1.5, 2.75),
+            [0, 0.18, 0.64, 0.18, 0],
+        ),  # survival at 1: 1 - 0.75²/(2.5·1.25) = 0.82, at 2: 0.18
         ((2.0, 0.0, 0.5), [0, 2 / 3, 1 / 3, 0, 0]),  # survival at 1: 1²/(2·1.5) = 1/3
         ((0.2, 0.2, 0.2), [0, 1, 0, 0, 0]),
         ((-1.0, -1.0, 1.0), [0.75, 0.25, 0, 0, 0]),  # survival at 0: 1²/(2·2) = 1/4
@@ -211,7 +224,15 @@ def test_a_triangle_spreads_over_bins_as_worked_out_by_hand(times, expected):
 def test_unreasonable_requests_are_refused_in_one_sentence(monkeypatch):
     mesh = plate((0, 0, 0.5), 0.1, 0.1)
     with pytest.raises(CaptureError, match=r"\[S, 3\]"):
-        simulate_transients(mesh, np.zeros((2, 3)), np.zeros((3, 3)), np.ones((2, 3)), np.ones((2, 3)), bin_length=0.01, n_bins=9)
+        simulate_transients(
+            mesh,
+            np.zeros((2, 3)),
+            np.zeros((3, 3)),
+            np.ones((2, 3)),
+            np.ones((2, 3)),
+            bin_length=0.01,
+            n_bins=9,
+        )
     with pytest.raises(UserError, match="positive"):
         transients(mesh, (0, 0, 0), (0, 0, 0), bin_length=0.0)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": 1 << 20}))

@@ -1,0 +1,100 @@
+"""From a scene's config to its capture: find or simulate the data, read it, gate it, sum it down."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pooch
+
+from data_modules.readers import ReaderOptions, read_capture
+from data_modules.simulate import SCENES, ScanPlan, SensorModel, load_truth, simulate_capture
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.surface_truth import SurfaceTruth
+
+log = logging.getLogger(__name__)
+
+
+def load_scene(
+    scene: Mapping[str, Any], data_dir: str | Path, seed: int
+) -> tuple[Capture, SurfaceTruth | None]:
+    """The scene's capture, ready to fit, and the true surface where it is known.
+
+    Args:
+        scene: a config of conf/scene.
+        data_dir: folder in which downloaded files are looked for.
+        seed: of the photon statistics of a simulated scene.
+
+    Raises:
+        UserError: the data are not there (says where they come from and where to put them) or not usable.
+    """
+    if scene["simulate"] is not None and scene["path"] is None:
+        capture, truth = _simulate(scene["simulate"], seed)
+    else:
+        path = find_file(scene, Path(data_dir))
+        capture, truth = read_capture(path, scene["format"], options=_options(scene["reader"])), None
+    if scene["truth"] is not None:
+        truth = _truth(load_truth(Path(scene["truth"])))
+    capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
+    if scene["gate"] is not None:
+        capture = capture.with_gate(*scene["gate"])
+    return capture, truth
+
+
+def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
+    """The scene's file: ``path`` as given, else that in ``data_dir``, else downloaded where a URL and a checksum are known."""
+    if scene["path"] is not None:
+        path = Path(scene["path"])
+        if not path.exists():
+            raise UserError(f"scene.path={path} does not exist")
+        return path
+    source = scene["source"]
+    if source is None:
+        raise UserError(
+            f"the scene '{scene['name']}' takes any capture file: give it as scene.path=FILE (docs/formats.md lists the formats)"
+        )
+    path = data_dir / source["file"]
+    if path.exists():
+        return path
+    if source["url"] is not None and source["sha256"] is not None:
+        log.info("downloading %s from %s", source["file"], source["url"])
+        try:
+            fetched = pooch.retrieve(
+                source["url"], f"sha256:{source['sha256']}", path.name, path.parent, progressbar=True
+            )
+        except Exception as problem:
+            raise UserError(
+                f"could not download {source['url']} ({problem}); fetch it by hand, put it at {path}, or give scene.path=FILE"
+            ) from problem
+        return Path(fetched)
+    raise UserError(
+        f"the scene '{scene['name']}' needs {source['file']}, which is not in {data_dir}/. It comes from {source['origin']}. "
+        f"Download it there and put it at {path}, or give its place as scene.path=FILE"
+    )
+
+
+def _options(reader: Mapping[str, Any]) -> ReaderOptions:
+    values = dict(reader)
+    if isinstance(values["wall_size"], list):
+        values["wall_size"] = tuple(values["wall_size"])
+    if isinstance(values["scan_order"], list):
+        values["scan_order"] = np.array(values["scan_order"])
+    return ReaderOptions(**values)
+
+
+def _simulate(plan: Mapping[str, Any], seed: int) -> tuple[Capture, SurfaceTruth]:
+    mesh = plan["mesh"]
+    if mesh not in SCENES:
+        raise UserError(f"no procedural scene is called {mesh!r}; there are {', '.join(SCENES)}")
+    capture, truth = simulate_capture(
+        SCENES[mesh](), ScanPlan(**plan["scan"]), SensorModel(**plan["sensor"]), seed=seed, progress=True
+    )
+    return capture, _truth(truth)
+
+
+def _truth(truth) -> SurfaceTruth:
+    return SurfaceTruth(truth.x, truth.y, truth.depth, truth.normal, truth.albedo)

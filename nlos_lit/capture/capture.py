@@ -1,0 +1,225 @@
+"""What was measured, and where: raw photon histograms with the geometry of the scan.
+
+World frame: relay wall near z = 0, hidden scene at z > 0, right-handed, metres. Time is optical path length in metres
+from the laser's wall point to the sensor's wall point; bin ``k`` covers ``[t_start + k·bin_length, t_start + (k+1)·bin_length)``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from nlos_lit.capture.errors import CaptureError
+
+SPEED_OF_LIGHT = 299_792_458.0  # m/s
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Raw transients and the geometry of the scan they were taken with.
+
+    Args:
+        counts: ``[S, T]`` photon counts as in the file (any unsigned or float dtype), never scaled, never zeroed.
+        laser: ``[S, 3]`` illuminated wall points, m.
+        sensor: ``[S, 3]`` observed wall points, m; equal to ``laser`` when confocal.
+        laser_normal: ``[S, 3]`` unit wall normals at ``laser``, towards the hidden scene.
+        sensor_normal: ``[S, 3]`` unit wall normals at ``sensor``.
+        bin_length: optical path length of one time bin, m (speed of light times bin width).
+        t_start: path length at the start of bin 0, m.
+        gate: ``(first, last)`` half-open range of bins that may be fitted (third bounce); None means all bins.
+        scan_shape: ``(nx, ny)`` for one scanned grid, spot ``s = i·ny + j`` at ``x_i, y_j``;
+            ``(lx, ly, sx, sy)`` for an exhaustive scan; None for irregular spots.
+        scan_order: ``[S]`` rank of each spot in the order of acquisition; None means row-major raster, i.e. ``arange(S)``.
+        exposure_s: exposure per spot in seconds, where known.
+        is_counts: False for expected values without photon statistics (renders); Poisson statements need True.
+        provenance: where the data came from and what was done to it, JSON-serialisable; ``steps`` lists the changes.
+
+    Raises:
+        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, or the gate is empty.
+    """
+
+    counts: np.ndarray
+    laser: np.ndarray
+    sensor: np.ndarray
+    laser_normal: np.ndarray
+    sensor_normal: np.ndarray
+    bin_length: float
+    t_start: float = 0.0
+    gate: tuple[int, int] | None = None
+    scan_shape: tuple[int, ...] | None = None
+    scan_order: np.ndarray | None = None
+    exposure_s: float | None = None
+    is_counts: bool = True
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.counts.ndim != 2 or 0 in self.counts.shape:
+            raise CaptureError(f"counts must be [spots, bins] and not empty; found shape {self.counts.shape}")
+        spots, bins = self.counts.shape
+        for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
+            points = np.asarray(getattr(self, name), dtype=np.float64)
+            if points.shape != (spots, 3):
+                raise CaptureError(f"{name} must be [{spots}, 3], one row a spot; found shape {points.shape}")
+            if not np.isfinite(points).all():
+                raise CaptureError(f"{name} holds NaN or infinite coordinates")
+            object.__setattr__(self, name, points)
+        for name in ("laser_normal", "sensor_normal"):
+            normals = getattr(self, name)
+            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+            if (lengths < 1e-6).any():
+                raise CaptureError(
+                    f"{name} holds a zero vector; wall normals must be unit vectors towards the hidden scene"
+                )
+            object.__setattr__(self, name, normals / lengths)
+        if not (np.isfinite(self.bin_length) and self.bin_length > 0):
+            raise CaptureError(f"bin_length must be a positive length in metres; found {self.bin_length}")
+        if not np.isfinite(self.t_start):
+            raise CaptureError(f"t_start must be finite; found {self.t_start}")
+        _check_counts(self.counts)
+        first, last = (0, bins) if self.gate is None else (int(self.gate[0]), int(self.gate[1]))
+        if not 0 <= first < last <= bins:
+            raise CaptureError(
+                f"the gate [{first}, {last}) leaves no bins of the capture's {bins}; give 0 <= first < last <= {bins}"
+            )
+        object.__setattr__(self, "gate", (first, last))
+        if self.scan_shape is not None:
+            shape = tuple(int(n) for n in self.scan_shape)
+            if len(shape) not in (2, 4) or int(np.prod(shape)) != spots:
+                raise CaptureError(f"scan_shape {shape} does not hold the capture's {spots} spots")
+            object.__setattr__(self, "scan_shape", shape)
+        order = np.arange(spots) if self.scan_order is None else np.asarray(self.scan_order, dtype=np.int64)
+        if order.shape != (spots,) or not np.array_equal(np.sort(order), np.arange(spots)):
+            raise CaptureError(
+                f"scan_order must be a permutation of 0 … {spots - 1}; found shape {order.shape}"
+            )
+        object.__setattr__(self, "scan_order", order)
+
+    @property
+    def n_spots(self) -> int:
+        return self.counts.shape[0]
+
+    @property
+    def n_bins(self) -> int:
+        return self.counts.shape[1]
+
+    @property
+    def confocal(self) -> bool:
+        """Laser and sensor look at the same wall point at every spot (within a hundredth of a bin)."""
+        return bool(np.abs(self.laser - self.sensor).max() < 0.01 * self.bin_length)
+
+    @property
+    def kind(self) -> str:
+        """``confocal``, ``exhaustive``, ``single_laser``, ``single_sensor`` or ``irregular``."""
+        if self.confocal:
+            return "confocal"
+        if self.scan_shape is not None and len(self.scan_shape) == 4:
+            return "exhaustive"
+        tolerance = 0.01 * self.bin_length
+        if np.ptp(self.laser, axis=0).max() < tolerance:
+            return "single_laser"
+        if np.ptp(self.sensor, axis=0).max() < tolerance:
+            return "single_sensor"
+        return "irregular"
+
+    @property
+    def bin_width_ps(self) -> float:
+        return self.bin_length / SPEED_OF_LIGHT * 1e12
+
+    @property
+    def path_gate(self) -> tuple[float, float]:
+        """The gate as optical path length, m."""
+        first, last = self.gate
+        return self.t_start + first * self.bin_length, self.t_start + last * self.bin_length
+
+    def gated_counts(self) -> np.ndarray:
+        """``[S, last - first]`` float32 copy of the bins inside the gate."""
+        first, last = self.gate
+        return self.counts[:, first:last].astype(np.float32)
+
+    def with_gate(self, first: int | None = None, last: int | None = None) -> Capture:
+        """The same counts with another gate, in bins; None keeps the present end."""
+        gate = (self.gate[0] if first is None else first, self.gate[1] if last is None else last)
+        return self._changed(f"gate [{gate[0]}, {gate[1]})", gate=gate)
+
+    def sum_bins(self, factor: int) -> Capture:
+        """Every ``factor`` neighbouring bins summed into one; a rest at the end is dropped.
+
+        The gate shrinks to whole new bins, so that nothing from outside it comes in.
+        """
+        if factor == 1:
+            return self
+        if not 1 <= factor <= self.n_bins:
+            raise CaptureError(f"cannot sum {factor} bins of {self.n_bins} into one")
+        bins = self.n_bins // factor
+        wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
+        summed = self.counts[:, : bins * factor].reshape(self.n_spots, bins, factor).sum(axis=2, dtype=wide)
+        gate = (-(-self.gate[0] // factor), min(self.gate[1] // factor, bins))
+        step = f"summed {factor} bins into one"
+        return self._changed(step, counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
+
+    def sum_spots(self, factor: int) -> Capture:
+        """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one at their mean position."""
+        if factor == 1:
+            return self
+        if self.scan_shape is None or len(self.scan_shape) != 2:
+            raise CaptureError("only a capture with one scanned grid [nx, ny] can be down-sampled in space")
+        if not 1 <= factor <= min(self.scan_shape):
+            raise CaptureError(
+                f"cannot sum {factor}×{factor} spots of a {self.scan_shape[0]}×{self.scan_shape[1]} scan into one"
+            )
+        nx, ny = (n // factor for n in self.scan_shape)
+
+        def blocks(values: np.ndarray) -> np.ndarray:
+            grid = values.reshape(*self.scan_shape, -1)[: nx * factor, : ny * factor]
+            return grid.reshape(nx, factor, ny, factor, -1)
+
+        wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
+        counts = blocks(self.counts).sum(axis=(1, 3), dtype=wide).reshape(nx * ny, -1)
+        means = {
+            name: blocks(getattr(self, name)).mean(axis=(1, 3)).reshape(nx * ny, 3)
+            for name in ("laser", "sensor", "laser_normal", "sensor_normal")
+        }
+        rank = blocks(self.scan_order).mean(axis=(1, 3)).reshape(-1)
+        order = np.argsort(np.argsort(rank, kind="stable"), kind="stable")
+        return self._changed(
+            f"summed {factor}×{factor} spots into one",
+            counts=_narrow(counts),
+            scan_shape=(nx, ny),
+            scan_order=order,
+            **means,
+        )
+
+    def _changed(self, step: str, **changes: Any) -> Capture:
+        provenance = {**self.provenance, "steps": [*self.provenance.get("steps", []), step]}
+        return dataclasses.replace(self, provenance=provenance, **changes)
+
+
+def _check_counts(counts: np.ndarray) -> None:
+    if counts.dtype.kind not in "uif":
+        raise CaptureError(f"counts must be numbers; found dtype {counts.dtype}")
+    if counts.dtype.kind == "f":
+        bad = counts.size - int(np.isfinite(counts).sum())
+        if bad:
+            raise CaptureError(
+                f"counts hold {bad} NaN or infinite values of {counts.size}; clean the file or mask those spots"
+            )
+    lowest = counts.min()
+    if lowest < 0:
+        raise CaptureError(
+            f"counts must not be negative; found {lowest} (background-subtracted data cannot be used as counts)"
+        )
+    if counts.max() == 0:
+        raise CaptureError("every count is zero; there is nothing to reconstruct")
+
+
+def _narrow(counts: np.ndarray) -> np.ndarray:
+    """Integers as the smallest of uint16/uint32/uint64 that holds them, floats as float32."""
+    if counts.dtype.kind == "f":
+        return counts.astype(np.float32)
+    for dtype in (np.uint16, np.uint32):
+        if counts.max() <= np.iinfo(dtype).max:
+            return counts.astype(dtype)
+    return counts

@@ -1,0 +1,120 @@
+"""Where a volume's voxels lie."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.aperture import scan_geometry
+from nlos_lit.capture.errors import CaptureError, UserError
+
+
+@dataclass(frozen=True)
+class VolumeGrid:
+    """A regular grid of voxel centres; volumes on it are tensors ``[nz, nx, ny]``, slice by slice like the scan.
+
+    Args:
+        origin: ``(x, y, z)`` of the centre of voxel ``[0, 0, 0]``, m.
+        pitch: ``(dx, dy, dz)`` spacing of voxel centres, m.
+        shape: ``(nz, nx, ny)`` numbers of voxels.
+    """
+
+    origin: tuple[float, float, float]
+    pitch: tuple[float, float, float]
+    shape: tuple[int, int, int]
+
+    @property
+    def x(self) -> np.ndarray:
+        return self.origin[0] + self.pitch[0] * np.arange(self.shape[1])
+
+    @property
+    def y(self) -> np.ndarray:
+        return self.origin[1] + self.pitch[1] * np.arange(self.shape[2])
+
+    @property
+    def z(self) -> np.ndarray:
+        return self.origin[2] + self.pitch[2] * np.arange(self.shape[0])
+
+    @property
+    def n_voxels(self) -> int:
+        nz, nx, ny = self.shape
+        return nz * nx * ny
+
+
+def volume_grid(
+    capture: Capture,
+    *,
+    depth: tuple[float, float],
+    depth_pitch: float | None = None,
+    refine: int = 1,
+    lateral: tuple[int, int] | None = None,
+) -> VolumeGrid:
+    """The voxels to image: laterally the scan's lattice (refined and extended on request), in depth ``depth`` metres.
+
+    Args:
+        depth: nearest and farthest voxel plane, m from the wall.
+        depth_pitch: spacing of planes, m; None takes half a bin length, which is one bin of path there and back.
+        refine: voxels per lattice step.
+        lateral: numbers of voxels along x and y, centred on the scan; None covers the scan.
+
+    Raises:
+        UserError: impossible numbers, or the volume lies outside the time window.
+    """
+    near, far = (float(v) for v in depth)
+    if not 0 < near < far:
+        raise UserError(
+            f"the volume's depth must satisfy 0 < nearest < farthest; found [{near:g}, {far:g}] m"
+        )
+    pitch_z = capture.bin_length / 2 if depth_pitch is None else float(depth_pitch)
+    if pitch_z <= 0 or refine < 1:
+        raise UserError(f"the depth pitch ({pitch_z:g} m) and the refinement ({refine}) must be positive")
+    nz = max(2, math.floor((far - near) / pitch_z + 1e-6) + 1)
+    geometry = scan_geometry(capture)
+    if geometry is not None:
+        lattice = geometry.lattice
+        first, steps, counts = lattice.origin, lattice.pitch, lattice.shape
+    else:
+        low, high = (
+            np.minimum(capture.sensor, capture.laser).min(0),
+            np.maximum(capture.sensor, capture.laser).max(0),
+        )
+        side = max(2, round(math.sqrt(capture.n_spots)))
+        steps = tuple(float((high[a] - low[a]) / (side - 1)) for a in (0, 1))
+        first, counts = tuple(float(v) for v in low), (side, side)
+        if min(steps) <= 0:
+            raise UserError("the spots lie on one line; a volume needs spots spread over the wall in x and y")
+    fine = tuple(s / refine for s in steps)
+    whole = tuple(int(n) for n in lateral) if lateral is not None else tuple(n * refine for n in counts)
+    skip = tuple((w - (n - 1) * refine - 1) // 2 for w, n in zip(whole, counts, strict=True))
+    origin = (first[0] - skip[0] * fine[0], first[1] - skip[1] * fine[1], first[2] + near)
+    grid = VolumeGrid(origin, (*fine, pitch_z), (nz, *whole))
+    path_range(capture, grid)
+    return grid
+
+
+def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
+    """Shortest and longest optical path, m, from laser through any voxel centre to sensor (bounds over the box).
+
+    Raises:
+        CaptureError: no such path falls inside the capture's gate, so nothing of the volume was measured.
+    """
+    lower = np.array([min(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
+    upper = np.array([max(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
+    shortest, longest = 0.0, 0.0
+    for points in (capture.laser, capture.sensor):
+        below, above = lower - points, points - upper
+        shortest = shortest + np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
+        longest = longest + np.linalg.norm(np.maximum(np.abs(below), np.abs(above)), axis=1)
+    first, last = capture.path_gate
+    shortest, longest = float(np.min(shortest)), float(np.max(longest))
+    if shortest >= last or longest <= first:
+        raise CaptureError(
+            f"the volume (depth {grid.z.min():.3g} to {grid.z.max():.3g} m, light paths {shortest:.3g} to {longest:.3g} m) lies "
+            f"outside the capture's time window (paths {first:.3g} to {last:.3g} m); move the volume (scene.volume.depth, "
+            f"within about {max(first, 0) / 2:.3g} to {last / 2:.3g} m) or the gate, or check the bin width "
+            f"({capture.bin_width_ps:.3g} ps)"
+        )
+    return shortest, longest

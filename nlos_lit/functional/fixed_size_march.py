@@ -1,0 +1,144 @@
+"""The march of :mod:`nlos_lit.functional.march` with tensors of fixed size, so that a GPU never waits for the host.
+
+The host cannot know how many rays meet something without waiting for the device. Here it gives capacities instead; what was
+needed is counted on the device and may be read now and then. Samples and hits are those of the other march while they fit.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool3d
+
+from nlos_lit.functional.march import Lattice, brick_maximum, constants, sample_unit, unit_scale
+
+BLOCK = 16  # neighbouring samples of a ray that are taken or left together
+
+
+class Capacity(NamedTuple):
+    """Rows there is room for."""
+
+    blocks: int
+    rays: int
+
+
+class StaticSamples(NamedTuple):
+    """``2·fine + 1`` samples around the maximum of each of ``capacity.rays`` rays; rows that are not ``used`` mean nothing."""
+
+    line: Tensor  # [K] spot·n² + ray
+    used: Tensor  # [K] bool
+    distance: Tensor  # [K, 2·fine + 1] m from the wall point
+    inside: Tensor  # [K, 2·fine + 1] whether the sample lies in the volume
+    needed: Tensor  # [2] blocks and rays that there should have been room for
+
+
+def compact(mask: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Places of the first ``capacity`` True elements (0 behind the last), which of these rows are used, and how many were True."""
+    rank = torch.cumsum(mask, 0)
+    row = torch.where(mask & (rank <= capacity), rank - 1, capacity)
+    places = torch.zeros(capacity + 1, dtype=torch.long, device=mask.device)
+    places.scatter_(0, row, torch.arange(len(mask), device=mask.device))
+    needed = rank[-1:]
+    return places[:capacity], torch.arange(capacity, device=mask.device) < needed, needed
+
+
+@torch.no_grad()
+def static_march(
+    volume: Tensor,
+    lattice: Lattice,
+    pitch: tuple[float, float, float],
+    origins: Tensor,
+    world: Tensor,
+    *,
+    threshold: float,
+    step: float,
+    fine: int,
+    capacity: Capacity | None,
+) -> StaticSamples:
+    """Args as of :func:`~nlos_lit.functional.march.march`, and
+
+    pitch: of the lattice, as numbers of the host.
+    world: ``[S, n·n, 3]`` directions of the rays.
+    capacity: None measures what is needed first, which waits for the device.
+    """
+    shape = lattice.shape
+    spots, rays = world.shape[:2]
+    last = constants((shape[1] - 1, shape[2] - 1, shape[0] - 1), origins)
+    inverse = 1 / torch.where(world.abs() < 1e-12, torch.full_like(world, 1e-12), world)
+    one = (lattice.origin - origins)[:, None] * inverse
+    two = (lattice.origin + last * lattice.pitch - origins)[:, None] * inverse
+    near, far = torch.minimum(one, two).amax(2).reshape(-1), torch.maximum(one, two).amin(2).reshape(-1)
+    first = torch.ceil(near / step - 0.5).clamp_min(0)
+    count = (torch.ceil(far / step - 0.5) - first).clamp_min(0)
+    diagonal = math.sqrt(
+        sum((p * (n - 1)) ** 2 for p, n in zip(pitch, (shape[1], shape[2], shape[0]), strict=True))
+    )
+    blocks = math.ceil((diagonal / step + 2) / BLOCK)
+
+    half = BLOCK * step / 2
+    size = tuple(max(1, round(half / abs(p))) for p in (pitch[2], pitch[0], pitch[1]))
+    reach = [
+        math.ceil(half / (s * abs(p)) + 1e-3)
+        for s, p in zip(size, (pitch[2], pitch[0], pitch[1]), strict=True)
+    ]
+    bricks = (brick_maximum(volume, size) >= threshold).to(torch.float32)
+    near_bricks = max_pool3d(bricks, [2 * r + 1 for r in reach], stride=1, padding=reach)[0, 0]
+
+    begin = torch.arange(blocks, device=volume.device) * BLOCK
+    middle = (first[:, None] + begin + BLOCK / 2) * step  # [S·n², blocks]
+    index = []
+    for axis, (s, cells) in enumerate(
+        zip((size[1], size[2], size[0]), (*near_bricks.shape[1:], near_bricks.shape[0]), strict=True)
+    ):
+        at = (
+            origins[:, None, None, axis]
+            - lattice.origin[axis]
+            + middle.view(spots, rays, -1) * world[..., axis, None]
+        ) / lattice.pitch[axis]
+        index.append((at / s).floor().clamp(0, cells - 1).long().view(-1, blocks))
+    flat = (index[2] * near_bricks.shape[1] + index[0]) * near_bricks.shape[2] + index[1]
+    occupied = (near_bricks.reshape(-1)[flat] > 0) & (begin < count[:, None])
+    if capacity is None:
+        capacity = _measured(occupied)
+    chosen, used, needed_blocks = compact(occupied.view(-1), capacity.blocks)
+    line, block = chosen // blocks, chosen % blocks
+    scale, shift = unit_scale(lattice)
+    turned = [1, 0, 2]
+    unit_origin, unit_world = (
+        ((origins - lattice.origin) * scale + shift)[:, turned],
+        (world * scale)[..., turned].reshape(-1, 3),
+    )
+    number = (block * BLOCK)[:, None] + torch.arange(BLOCK, device=volume.device)
+    distance = (first[line][:, None] + number + 0.5) * step
+    points = unit_origin[line // rays][:, None] + distance[..., None] * unit_world[line][:, None]
+    value = sample_unit(volume, points.view(-1, 3)).view(-1, BLOCK)
+    value = torch.where((number < count[line][:, None]) & used[:, None] & (value >= threshold), value, -1.0)
+    peak = torch.full((spots * rays,), -1.0, device=volume.device).scatter_reduce(
+        0, line, value.amax(1), "amax"
+    )
+    at_peak = torch.where((value == peak[line][:, None]) & (value > 0), distance, torch.inf).amin(1)
+    best = torch.full((spots * rays,), torch.inf, device=volume.device).scatter_reduce(
+        0, line, at_peak, "amin"
+    )
+    line, used, needed_rays = compact(peak > 0, capacity.rays)
+    best = torch.where(used, best[line], 1.0)  # any place off the wall
+    offsets = torch.arange(-fine, fine + 1, device=volume.device)
+    distance = best[:, None] + offsets * (step / fine)
+    position = (
+        origins[line // rays][:, None]
+        + distance[..., None] * world.reshape(-1, 3)[line][:, None]
+        - lattice.origin
+    ) / lattice.pitch
+    inside = (position >= 0) & (position <= last)
+    return StaticSamples(
+        line, used, distance, inside.all(2) | (offsets == 0), torch.cat([needed_blocks, needed_rays])
+    )
+
+
+def _measured(occupied: Tensor) -> Capacity:
+    """Half as many blocks again as are occupied now; a ray needs at least one."""
+    blocks = int(occupied.sum() * 1.5) + 1024
+    return Capacity(blocks, min(blocks, len(occupied)))

@@ -1,0 +1,57 @@
+"""The base of a diagnosis: image, surfels, response, fitted to one part of the scan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
+from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.split import Split
+from nlos_lit.model.build import PipelineSettings, build_pipeline
+from nlos_lit.runtime.memory import check_machine
+from nlos_lit.surfels.fit import RefineSettings, SurfelFit
+from nlos_lit.surfels.refine import refine
+
+
+@dataclass(frozen=True)
+class BasePipeline:
+    """From counts to fitted surfels; picklable, so that toys can go through all of it in other processes.
+
+    ``volume``: arguments of :func:`~nlos_lit.capture.volume_grid.volume_grid`. ``budget``: bytes for the phasor field.
+    """
+
+    volume: Mapping[str, Any]
+    model: PipelineSettings
+    surfels: RefineSettings
+    budget: int
+
+    def image(self, capture: Capture) -> tuple[Tensor, VolumeGrid]:
+        """The phasor image of all spots, ``[nz, nx, ny]``, at the start values of Θ_pf."""
+        grid = volume_grid(capture, **self.volume)
+        phasor = build_pipeline(capture, grid, self.model).phasor
+        plan = phasor.plan(capture, self.budget)
+        check_machine(plan.total_bytes, "the phasor field")
+        phasor.prepare(capture, plan)
+        with torch.no_grad():
+            return phasor().cpu(), grid
+
+    def fit(
+        self,
+        capture: Capture,
+        split: Split,
+        image: tuple[Tensor, VolumeGrid],
+        extension: Extension,
+        seed: int,
+    ) -> SurfelFit:
+        """Surfels from new seeds, with the given effects."""
+        return refine(capture, *image, self.surfels, split.fit, extension=extension, seed=seed).fit
+
+    def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
+        """Image and fit without effects."""
+        return self.fit(capture, split, self.image(capture), Extension([]), seed)

@@ -1,0 +1,89 @@
+"""A whole diagnosis of one capture, from counts to verdict."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+from pathlib import Path
+
+from torch import Tensor
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.assemble import assemble
+from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.criticise import CriticismSettings, Findings, criticise
+from nlos_lit.inference.numerics import numerics
+from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.split import split_spots
+from nlos_lit.inference.toys import run_toys
+from nlos_lit.runtime.steps import Report, Steps
+from nlos_lit.surfels.fit import SurfelFit
+
+
+def diagnose(
+    capture: Capture,
+    pipeline: BasePipeline,
+    options: CriticismSettings,
+    *,
+    name: str,
+    seed: int,
+    image: tuple[Tensor, VolumeGrid] | None = None,
+    folder: Path | None = None,
+    settings: str = "",
+    report: Report = lambda text, passed, left: None,
+) -> tuple[Diagnosis, Findings]:
+    """Fit, criticise, measure.
+
+    Args:
+        capture: raw counts; nothing else about the measurement is known.
+        image: ``[nz, nx, ny]`` and its grid, where a run has made it already.
+        folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same arguments goes on; needed
+            with ``options.toys``.
+        settings, report: see :class:`~nlos_lit.runtime.steps.Steps`.
+
+    Raises:
+        UserError: the scan is too small to be split, the capture holds no counts but expectations, or no surface is found.
+    """
+    began = time.perf_counter()
+    if not capture.is_counts:
+        raise UserError(
+            "a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first"
+        )
+    split, scan = split_spots(capture), Scan.of(capture)
+    steps = Steps(report, None if folder is None else folder / "steps", settings)
+    steps.share({"capture": capture, "settings": pipeline.surfels})
+    steps.plan(
+        image=image is None,
+        fit=1 + options.finalists,
+        screen=2,
+        refit=1 + options.rivals,
+        check=options.numerics,
+    )
+    if image is None:
+        image = steps("image", "imaging", "image", lambda: pipeline.image(capture))
+    base = steps(
+        "fit", "fitting the base", "base", lambda: pipeline.fit(capture, split, image, Extension([]), seed)
+    )
+    steps.share({"counts": base.counts, "grid": base.grid, "reserve": base.reserve})
+
+    def rebuild(extension: Extension, with_seed: int) -> SurfelFit:
+        again = pipeline.fit(capture, split, image, extension, with_seed)
+        again.counts = base.counts
+        return again
+
+    found = criticise(base, rebuild, split, scan, options, seed, steps)
+    null = None
+    if options.toys:
+        null = run_toys(capture, base, pipeline, split, options, folder / "toys", report)
+    checks = {}
+    if options.numerics:
+        steps.plan(check=1)
+        other = found.turns[0].controls[-1] if found.turns[0].controls else None
+        vary = partial(numerics, pipeline, capture, split, image, base, seed, other)
+        checks = steps("check", "varying the numerics", "numerics", vary)
+    seconds = time.perf_counter() - began + steps.earlier
+    return assemble(capture, found, split, scan, options, null, checks, name, seconds, seed), found

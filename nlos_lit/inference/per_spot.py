@@ -1,0 +1,98 @@
+"""Effects with one random number a spot: nothing can be predicted for a spot that was not measured, but its scatter can.
+
+A spot's coefficient δ is drawn from N(0, σ²), with probability π where it is sparse and positive (half normal), else always. With
+the spot's own score s and information F the marginal likelihood over δ is, up to what does not depend on σ (Laplace; exact for
+Gaussian counts),
+
+    ln[(1 - π) + π exp(½ σ²s²/(1 + σ²F)) / √(1 + σ²F)]
+
+(half normal: the second term times 2Φ of the posterior's mean in its standard deviations).
+
+So spots that no fit saw still say whether the width is right.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.problem import effect_columns
+from nlos_lit.surfels.model import SurfelModel
+
+SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
+
+
+def sparse(effect: Effect) -> bool:
+    """Its coefficients are positive and rare."""
+    return effect.amplitudes[0].lower == effect.amplitudes[0].null
+
+
+def factors(score: Tensor, information: Tensor, width: float, share: float, positive: bool) -> Tensor:
+    """``[S]`` log marginal likelihood ratio of each spot against no effect."""
+    grown = 1 + width**2 * information
+    factor = 0.5 * width**2 * score**2 / grown - 0.5 * grown.log()
+    if not positive:
+        return factor
+    factor = factor + math.log(2) + torch.special.log_ndtr(width * score * grown.rsqrt())
+    return torch.logaddexp(torch.tensor(math.log1p(-share), dtype=score.dtype), math.log(share) + factor)
+
+
+def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[float, float, float]:
+    """Gain (nats), width and share that maximise the marginal likelihood; gain 0 where nothing does better than none."""
+    typical = float(information.median().clamp_min(1e-30).rsqrt())
+    best = (0.0, 0.0, 1.0)
+    for k in torch.arange(-6, 13, 0.5).tolist():
+        for share in SHARES if positive else (1.0,):
+            width = typical * 2.0**k
+            gain = float(factors(score, information, width, share, positive).sum())
+            best = max(best, (gain, width, share))
+    if best[0] == 0.0:
+        return best
+
+    def loss(octaves: float) -> float:
+        return -float(factors(score, information, 2.0**octaves, best[2], positive).sum())
+
+    middle = math.log2(best[1])
+    found = minimize_scalar(
+        loss, bounds=(middle - 0.5, middle + 0.5), method="bounded", options={"xatol": 1e-3}
+    )
+    return max(best, (-float(found.fun), 2.0 ** float(found.x), best[2]))
+
+
+def coefficients(score: Tensor, information: Tensor, width: float, positive: bool) -> Tensor:
+    """``[S]`` posterior means; sparse ones only where they stand out by 3.5 standard deviations."""
+    if positive:
+        return torch.where(
+            score > 3.5 * information.sqrt(), score / information.clamp_min(1e-30), torch.zeros_like(score)
+        )
+    return width**2 * score / (1 + width**2 * information)
+
+
+def spot_scores(
+    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Score and information ``[S]`` of each spot's own coefficient at its present value, and expected counts ``[S, T]``."""
+    with torch.no_grad():
+        expected = model.expected(spots, extension).double().clamp_min(1e-6)
+    column = effect_columns(model, extension, spots, effect).view(expected.shape).double()
+    return (column * (counts / expected - 1)).sum(1), (column**2 / expected).sum(1).clamp_min(1e-30), expected
+
+
+@torch.no_grad()
+def solve(
+    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor, rounds: int = 4
+) -> None:
+    """Set the coefficients of ``spots`` to their posterior means by Newton steps, the width re-estimated from their scatter."""
+    p = effect.amplitudes[0]
+    raw = getattr(effect, f"raw_{p.name}")
+    for _ in range(rounds):
+        score, information, _ = spot_scores(model, extension, effect, spots, counts)
+        around = score + information * raw[spots].double()  # the score that a start at 0 would have had
+        _, effect.width, effect.share = best_width(around, information, sparse(effect))
+        raw[spots] = coefficients(around, information, effect.width, sparse(effect)).float()
+        effect.clamp()

@@ -1,0 +1,274 @@
+"""How the expected counts answer to everything that is, or could be, in the model: columns of one weighted least-squares problem.
+
+Rows are gated bins of the looked-at spots, divided by √μ, so that counts of the model itself have unit variance.
+
+- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, smooth tilts of all normals, the
+  laser-sensor response, and the parameters of effects that were accepted before.
+- ``r [N]``: residual (counts - μ)/√μ.
+- ``Z [N, K]``: effects at their null, :func:`effect_columns`.
+
+All derivatives are exact (forward mode); the response, gain and counting stages enter through the Jacobian of
+:meth:`SurfelModel.record`, one ``[T, T]`` matrix a spot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.smooth_basis import smooth_map_basis
+from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
+from nlos_lit.surfels.model import SurfelModel
+
+TILT_PRIOR = 0.1  # rad: how far normals may lean together, away from the surface's own slope
+CHUNK = 1 << 25  # elements of a batch's columns
+
+
+@dataclass
+class Problem:
+    """Everything about one model and one set of spots that screening needs.
+
+    Args:
+        spots: ``[S]``, one row block of ``bins`` rows each. expected: ``[S, bins]`` μ.
+        nuisance: ``[S·bins, P]`` X. prior: ``[P]`` precision of each nuisance column's coefficient.
+        residual: ``[S·bins]``. transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
+    """
+
+    model: SurfelModel
+    extension: Extension
+    spots: Tensor
+    counts: Tensor
+    expected: Tensor
+    nuisance: Tensor
+    prior: Tensor
+    residual: Tensor
+    transients: Tensor
+
+    @property
+    def bins(self) -> int:
+        return self.expected.shape[1]
+
+
+def build_problem(
+    model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor, with_effects: bool = True
+) -> Problem:
+    """Nuisance columns and residual of ``spots`` ``[S]`` with gated counts ``[S, T_gate]``.
+
+    ``with_effects``: parameters of the extension's effects are nuisance, too.
+    """
+    with torch.no_grad():
+        expected = model.expected(spots, extension).clamp_min(1e-6)
+    m = len(model)
+    tilts = tilt_fields(model)
+    size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
+    surfels, others, light = [], [], []
+    response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
+    for part in spots.split(size):
+        with torch.no_grad():
+            light.append(model.transients(model.paths(part), part, extension))
+        surfels.append(_surfel_columns(model, extension, part, light[-1], tilts))
+        forward = _recording(model, extension, part, light[-1])
+        both = [
+            _jvp(forward, name, p, torch.ones_like(p))[:, model.gate[0] :] for name, p in response.items()
+        ]
+        others.append(torch.stack(both, -1).flatten(0, 1))
+    transients = torch.cat(light)
+    accepted = [e for e in extension.effects if with_effects and not e.per_spot]
+    more = [effect_columns(model, extension, spots, e, shapes=True, transients=transients) for e in accepted]
+    nuisance = torch.cat([torch.cat(surfels), torch.cat(others), *more], 1)
+    weight = expected.reshape(-1).rsqrt()
+    nuisance *= weight[:, None]
+    residual = (counts - expected).reshape(-1) * weight
+    prior = torch.zeros(nuisance.shape[1])
+    prior[2 * m : 2 * m + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
+    if accepted:
+        own = torch.cat([e.precision() for e in accepted])
+        prior[len(prior) - len(own) :] = own
+    return Problem(model, extension, spots, counts, expected, nuisance, prior, residual, transients)
+
+
+def effect_columns(
+    model: SurfelModel,
+    extension: Extension,
+    spots: Tensor,
+    effect: Effect,
+    shapes: bool = False,
+    transients: Tensor | None = None,
+) -> Tensor:
+    """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the extension.
+
+    ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every spot's own.
+    ``transients``: ``[S, T]`` of these spots, where they are known already.
+    """
+    first, present = model.gate[0], list(extension.effects)
+    whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
+    index = list(whole.effects).index(effect)
+    wanted = effect.amplitudes + (effect.shapes if shapes else [])
+    names = [
+        (f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted
+    ]
+    parts = []
+    size = _path_batch(model) if effect.needs_paths or transients is None else 256
+    for start in range(0, len(spots), size):
+        part = spots[start : start + size]
+        forward = _staged(
+            model, whole, effect, part, None if transients is None else transients[start : start + size]
+        )
+        columns = []
+        for name, raw, number in names:
+            for k in range(1 if effect.per_spot else number):
+                tangent = torch.ones_like(raw) if effect.per_spot else torch.zeros_like(raw)
+                tangent[k] = 1.0
+                columns.append(_jvp(forward, name, raw, tangent))
+        parts.append(torch.stack(columns, -1)[:, first:].flatten(0, 1))
+    return torch.cat(parts)
+
+
+def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
+    """:func:`effect_columns` of a problem's spots, divided by √μ."""
+    columns = effect_columns(
+        problem.model, problem.extension, problem.spots, effect, shapes, problem.transients
+    )
+    return columns * problem.expected.reshape(-1, 1).rsqrt()
+
+
+def acting_order(effect: Effect) -> int:
+    """Sort key: the registry's order, which is that of the light's way."""
+    return EFFECTS.index(type(effect))
+
+
+class _Forward(nn.Module):
+    """Model and extension as one module, so that any parameter can be replaced by a dual number."""
+
+    def __init__(
+        self, model: SurfelModel, extension: Extension, call: Callable[[SurfelModel, Extension], Tensor]
+    ) -> None:
+        super().__init__()
+        self.model, self.extension, self.call = model, extension, call
+
+    def forward(self) -> Tensor:
+        return self.call(self.model, self.extension)
+
+
+@torch.no_grad()
+def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor:
+    def at(v: Tensor) -> Tensor:
+        return torch.func.functional_call(forward, {name: v}, ())
+
+    return torch.func.jvp(at, (value.detach(),), (tangent,))[1]
+
+
+@torch.no_grad()
+def _staged(
+    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None
+) -> _Forward:
+    """The part of the forward model that comes after what ``effect`` cannot change, with the part before worked out."""
+    if effect.needs_paths:
+        paths = model.paths(spots)
+        return _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
+    if transients is None:
+        transients = model.transients(model.paths(spots), spots, extension)
+    if effect.stage == "response":
+        return _recording(model, extension, spots, transients)
+    signal = model.signal(transients, extension)
+    if effect.stage == "spot":
+        return _Forward(model, extension, lambda m, e: m.detect(signal, spots, e))
+    light = extension.gain(signal, spots) + extension.background(model.laser_sensor.background(), spots)
+    return _Forward(model, extension, lambda m, e: e.counting(light, spots))
+
+
+def _recording(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> _Forward:
+    return _Forward(model, extension, lambda m, e: m.record(transients, spots, e))
+
+
+def _surfel_columns(
+    model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor, tilts: Tensor
+) -> Tensor:
+    """``[B·T_gate, P]`` derivatives of the expected counts by all surfels' parameters."""
+    jacobian = _record_jacobian(model, extension, spots, transients)
+    return torch.bmm(jacobian, _transient_columns(model, extension, spots, tilts)).flatten(0, 1)
+
+
+@torch.no_grad()
+def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
+    """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), exact for any response, gain and counting stage."""
+    b, t = transients.shape
+    repeated, again = transients.repeat_interleave(t, 0), spots.repeat_interleave(t)
+    unit = torch.eye(t).repeat(b, 1)
+    _, rows = torch.func.jvp(lambda x: model.record(x, again, extension), (repeated,), (unit,))
+    return rows.view(b, t, t)[:, :, model.gate[0] :].transpose(1, 2)
+
+
+@torch.no_grad()
+def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor) -> Tensor:
+    """``[B, T, 2M + 2F]`` derivatives of the transients by albedos (in units of themselves), depths (in bins) and tilts."""
+    centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
+    unit = albedo_unit(albedo)
+    walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
+    offsets = quadrature(model.quadrature, centre.device)
+    seen = model.visible[spots][:, :, None] if len(model.visible) else 1.0
+
+    def place(rho: Tensor, depth: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+        leaning = torch.nn.functional.normalize(normal + a[:, None] * across + b[:, None] * along, dim=1)
+        moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction
+        paths = trace(moved, leaning, model.cell, offsets, *walls, model.confocal)
+        paths = paths._replace(contribution=paths.contribution * seen)
+        energy = extension.path(paths.contribution * rho[:, None], paths, spots)
+        return energy, model.arrival(extension.time(paths.length, paths, spots))
+
+    across, along = tilt_frame(normal)
+    zero, one = torch.zeros_like(albedo), torch.ones_like(albedo)
+    start = (albedo, zero, zero, zero)
+    blocks = []
+    for k, direction in enumerate((unit, one, one, one)):
+        step = tuple(direction if i == k else zero for i in range(4))
+        (energy, time), (d_energy, d_time) = torch.func.jvp(place, start, step)
+        first, weights = spline_weights(time)
+        values = d_energy[..., None] * weights
+        if k:
+            values = values + (energy * d_time)[..., None] * spline_slopes(time)
+        dense = _scatter_surfels(values, first, model.n_bins)
+        blocks.append(dense if k < 2 else dense @ tilts)
+    return torch.cat(blocks, 2)
+
+
+def _scatter_surfels(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
+    """``[B, T, M]`` from ``[B, M, Q, 4]`` values that start at bins ``first`` ``[B, M, Q]``."""
+    b, m = first.shape[:2]
+    pad = 4
+    start = (first.clamp(-pad, n_bins) + pad) + (n_bins + 2 * pad) * torch.arange(b)[:, None, None]
+    flat = torch.zeros(b * (n_bins + 2 * pad) * m)
+    column = torch.arange(m)[:, None]
+    for k in range(4):
+        flat.index_add_(0, ((start + k) * m + column).reshape(-1), values[..., k].reshape(-1))
+    return flat.view(b, n_bins + 2 * pad, m)[:, pad:-pad]
+
+
+def tilt_fields(model: SurfelModel) -> Tensor:
+    """``[M, F]`` smooth functions over the hidden scene (mean square 1 each), the constant first."""
+    xy = model.centre().detach()[:, :2]
+    low, high = xy.amin(0), xy.amax(0)
+    place = 2 * (xy - low) / (high - low).clamp_min(1e-6) - 1
+    fields = smooth_map_basis(place, 5)[0] if len(xy) > 50 else place[:, :0]
+    return torch.cat([torch.ones(len(xy), 1), fields], 1)
+
+
+def tilt_frame(normal: Tensor) -> tuple[Tensor, Tensor]:
+    """Two directions ``[M, 3]`` in which each normal may lean, the first as nearly along x as it can be."""
+    across = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal, dim=1)
+    return across, torch.linalg.cross(normal, across)
+
+
+def albedo_unit(albedo: Tensor) -> Tensor:
+    """``[M]`` that albedo columns count in: the albedo itself, for weak surfels a twentieth of the mean."""
+    return torch.maximum(albedo, 0.05 * albedo.mean())
+
+
+def _path_batch(model: SurfelModel) -> int:
+    return max(1, (1 << 21) // max(1, len(model) * model.quadrature**2))

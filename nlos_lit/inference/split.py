@@ -1,0 +1,55 @@
+"""Which spots are fitted, which select between explanations, and which nothing but the last figure may see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+
+ROLES = ("fit", "fit", "select", "fit", "fit", "test", "fit", "select")
+STRIDE = 3  # coprime to the number of roles: every row and column of blocks has all roles
+
+
+@dataclass(frozen=True)
+class Split:
+    """Rows of the capture by role, and the wall block of every spot (``[S]``, contiguous patches)."""
+
+    fit: np.ndarray
+    select: np.ndarray
+    test: np.ndarray
+    block: np.ndarray
+
+    def folds(self, spots: Tensor, number: int) -> Tensor:
+        """Fold of each spot: whole blocks, dealt so that neighbours differ."""
+        names, index = np.unique(self.block[spots.numpy()], return_inverse=True)
+        order = np.random.default_rng(0).permutation(len(names)) % number
+        return torch.from_numpy(order[index])
+
+
+def split_spots(capture: Capture, blocks: int = 8) -> Split:
+    """About ``blocks × blocks`` contiguous patches of the wall: five eighths to fit, a quarter to select, an eighth untouched.
+
+    Contiguous, because random spots leak through their neighbours. Spots without a single gated count were not measured.
+
+    Raises:
+        UserError: a role is left without spots.
+    """
+    points = [p for p in (capture.laser, capture.sensor) if np.ptp(p, axis=0).max() > 0]
+    xy = points[-1][:, :2] if points else capture.laser[:, :2]
+    low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
+    place = np.minimum((xy - low) / extent * blocks, blocks - 1e-6).astype(int)
+    role = np.array(ROLES)[(place[:, 0] + STRIDE * place[:, 1]) % len(ROLES)]
+    first, last = capture.gate
+    measured = capture.counts[:, first:last].any(1)
+    parts = {name: np.flatnonzero((role == name) & measured) for name in ("fit", "select", "test")}
+    for name, spots in parts.items():
+        if len(spots) < 8:
+            raise UserError(
+                f"only {len(spots)} measured spots are left to {name}; a diagnosis needs a scan of at least 16 × 16 spots"
+            )
+    return Split(**parts, block=place[:, 0] * blocks + place[:, 1])

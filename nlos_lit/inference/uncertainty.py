@@ -1,0 +1,103 @@
+"""Parameters of accepted effects with their uncertainties, from the curvature of the whole fit."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.effect import Effect
+from nlos_lit.inference.joint_step import shift
+from nlos_lit.inference.problem import build_problem, weighted_columns
+from nlos_lit.inference.result import Estimate
+from nlos_lit.inference.screen import Projector
+from nlos_lit.surfels.fit import SurfelFit
+
+REACH = 3.0  # standard errors over which quantities are displaced
+
+
+class Uncertainty:
+    """Joint covariance of all parameters of all effects, the base projected off.
+
+    The larger of two: F⁻¹ (counts alone) and F⁻¹(Σ_b s_b s_bᵀ)F⁻¹ (scatter of the score between wall blocks, which also feels
+    misfit; Huber's sandwich).
+
+    Args:
+        spots: ``[S]`` fitted spots that are looked at, with gated ``counts`` and wall ``block``.
+        share: of all fitted spots that these are: the others have as much to say.
+    """
+
+    def __init__(
+        self, fit: SurfelFit, spots: Tensor, counts: Tensor, block: Tensor, share: float = 1.0
+    ) -> None:
+        self.fitted = len(fit.train) / fit.capture.n_spots
+        self.effects = [e for e in fit.extension.effects if not e.per_spot]
+        if not self.effects:
+            return
+        problem = build_problem(fit.model, fit.extension, spots, counts, with_effects=False)
+        projector = Projector(problem)
+        z = projector.off(torch.cat([weighted_columns(problem, e, shapes=True) for e in self.effects], 1))
+        information = (z.T @ z).double() + torch.diag(
+            torch.cat([e.precision() for e in self.effects]).double() * share
+        )
+        floor = 1e-9 * information.diagonal().mean() * torch.eye(len(information), dtype=torch.float64)
+        inverse = torch.linalg.inv(information + floor)
+        by_spot = (z * projector.residual[:, None]).view(len(spots), -1, z.shape[1]).sum(1).double()
+        names, index = torch.unique(block, return_inverse=True)
+        by_block = torch.zeros(len(names), z.shape[1], dtype=torch.float64).index_add_(0, index, by_spot)
+        robust = inverse @ (by_block.T @ by_block) @ inverse
+        grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
+        self.covariance = share * inverse * grow[:, None] * grow[None, :]
+
+    def parameters(self, effect: Effect, again: Effect | None = None) -> dict[str, Estimate]:
+        """Reported quantities and their errors. The width of per-spot effects: from the number of spots.
+
+        An error is a third of the change over three standard errors along each axis of the covariance, the larger of both ways, in
+        quadrature: the delta method where a quantity is linear, and more where it bends, as the length of a vector does whose
+        largest component is not settled. ``again``: the same effect in a fit from new seeds; the difference is an error, too.
+        """
+        if effect.per_spot:
+            return _spread(effect, self.fitted)
+        offset = sum(e_size(e) for e in self.effects[: self.effects.index(effect)])
+        variance, axes = torch.linalg.eigh(
+            self.covariance[offset : offset + e_size(effect), offset : offset + e_size(effect)]
+        )
+        steps = REACH * variance.clamp_min(0).sqrt() * axes
+        moved = [[_displaced(effect, sign * step) for sign in (1, -1)] for step in steps.T.float()]
+        elsewhere = {} if again is None else _values(again)
+        found = {}
+        for name, quantity in effect.quantities().items():
+            value = float(quantity.value.detach())
+            errors = [max(abs(side[name] - value) for side in both) / REACH for both in moved]
+            errors.append(abs(elsewhere.get(name, value) - value))
+            found[name] = Estimate(value, math.hypot(*errors), quantity.unit)
+        return found
+
+
+def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
+    """Quantities with all stored values moved by ``step``, without regard to bounds."""
+    moved = copy.deepcopy(effect)
+    shift(moved, step, shapes=True)
+    return _values(moved)
+
+
+def _values(effect: Effect) -> dict[str, float]:
+    return {name: float(quantity.value.detach()) for name, quantity in effect.quantities().items()}
+
+
+def e_size(effect: Effect) -> int:
+    """Number of an effect's stored values."""
+    return sum(p.size for p in effect.declared.values())
+
+
+def _spread(effect: Effect, share: float) -> dict[str, Estimate]:
+    """Of a per-spot effect, from the spots that have a number; ``share`` of all spots were fitted. Numbers of spots are for all."""
+    known = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
+    found = {}
+    for name, (quantity, unit, spots) in effect.quantities().items():
+        value = float(quantity.detach())
+        error = value**0.5 if spots else value / (2 * known) ** 0.5
+        found[name] = Estimate(value / share, error / share, unit) if spots else Estimate(value, error, unit)
+    return found

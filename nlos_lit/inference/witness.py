@@ -1,0 +1,86 @@
+"""The direct pulse (first bounce), outside the gate and seen by no fit: does it agree with what was found?
+
+Its energy at a spot is laser power × wall reflectance × collection, its decay the detector's slow tail.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from nlos_lit.capture import Capture
+from nlos_lit.surfels.fit import SurfelFit
+
+LEAST = 20.0  # counts a spot before the gate that make a witness
+GAINS = ("wall_reflectance", "power_drift", "vignetting")
+SLOW = (
+    "irf_tail",
+    "afterpulsing",
+)  # both follow the direct pulse, too, with the decay that they have inside the gate
+
+
+def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
+    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None without the pulse."""
+    first = capture.gate[0]
+    before = capture.counts[:, :first].sum(1, dtype=np.float64)
+    if first == 0 or before.mean() < LEAST or not capture.confocal:
+        return None
+    found: dict[str, Any] = {
+        "direct_pulse_counts": float(before.mean()),
+        "wall_gain_correlation": None,
+        "tail_decay_fitted_m": None,
+        "tail_decay_direct_m": None,
+        "maps": None,
+    }
+    effects = {e.name: e for e in fit.extension.effects}
+    gain = log_gain(fit, capture.n_spots)
+    if gain is not None:
+        found["wall_gain_correlation"] = float(np.corrcoef(gain, np.log(before.clip(1)))[0, 1])
+        if capture.scan_shape is not None and len(capture.scan_shape) == 2:
+            maps = {"direct": before / before.mean(), "fitted": np.exp(gain)}
+            found["maps"] = {name: m.reshape(capture.scan_shape).tolist() for name, m in maps.items()}
+    slow = next((effects[name] for name in SLOW if name in effects), None)
+    if slow is not None:
+        found["tail_decay_fitted_m"] = float(slow.value("decay").detach())
+        found["tail_decay_direct_m"] = direct_decays(capture)
+    return found
+
+
+@torch.no_grad()
+def log_gain(fit: SurfelFit, n_spots: int) -> np.ndarray | None:
+    """``[S]`` log of all fitted gains together; None where no effect changes the gain."""
+    acting = [e for e in fit.extension.effects if e.name in GAINS]
+    if not acting:
+        return None
+    spots, signal = torch.arange(n_spots), torch.ones(n_spots, 1)
+    for effect in acting:
+        signal = effect.gain(signal, spots)
+    return signal[:, 0].log().numpy()
+
+
+def direct_decays(capture: Capture) -> list[float] | None:
+    """Decay lengths (m) of the mean direct pulse, early and late: fits of an exponential to two stretches behind its peak.
+
+    The level before the gate's start is taken as background. Early is from 1/20 to 1/200 of the peak, late the rest down to three
+    times the background.
+    """
+    mean = capture.counts[:, : capture.gate[0]].mean(0, dtype=np.float64)
+    peak = int(mean.argmax())
+    tail = mean[peak:]
+    level = float(np.median(tail[-max(8, len(tail) // 8) :]))
+    above = tail - level
+    marks = [np.flatnonzero(above < above[0] * f) for f in (1 / 20, 1 / 200)]
+    end = np.flatnonzero(above < max(3 * level, 1e-4 * above[0]))
+    if any(len(m) == 0 for m in marks):
+        return None
+    stops = [int(marks[0][0]), int(marks[1][0]), int(end[0]) if len(end) else len(tail)]
+    found = []
+    for a, b in ((stops[0], stops[1]), (stops[1], stops[2])):
+        if b - a < 4:
+            continue
+        x, y = np.arange(a, b), np.log(above[a:b].clip(1e-9))
+        slope = np.polyfit(x, y, 1, w=np.sqrt(above[a:b].clip(0)))[0]
+        found.append(float(-capture.bin_length / slope) if slope < 0 else float("nan"))
+    return found or None

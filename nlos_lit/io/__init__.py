@@ -1,0 +1,1 @@
+"""Results on disk: volumes, points, meshes, JSON; each a whole file or none."""

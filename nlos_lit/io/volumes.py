@@ -1,0 +1,64 @@
+"""Volumes on disk: HDF5 with their axes in metres."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.io.files import whole_file
+
+AXES = ("x", "y", "z")
+
+
+def write_volume(
+    path: Path | str, values: np.ndarray, grid: VolumeGrid, **extra_datasets: np.ndarray
+) -> None:
+    """HDF5 with ``volume`` [nz, nx, ny] float32, its axes ``x``, ``y``, ``z`` in metres, and a dataset for each extra volume.
+
+    Raises:
+        ValueError: ``values`` or an extra volume is not of the grid's shape.
+    """
+    volumes = {"volume": values, **extra_datasets}
+    for name, array in volumes.items():
+        if np.shape(array) != tuple(grid.shape):
+            raise ValueError(f"{name} has shape {np.shape(array)}, its grid {tuple(grid.shape)}")
+    with whole_file(path) as partial, h5py.File(partial, "w") as file:
+        file.attrs["frame"] = (
+            "relay wall near z = 0, hidden scene at z > 0, right-handed, +y up; x, y, z are voxel centres"
+        )
+        file.attrs["origin"] = grid.origin
+        file.attrs["pitch"] = grid.pitch
+        for name in AXES:
+            file.create_dataset(name, data=getattr(grid, name))
+            file[name].attrs["unit"] = "m"
+        for name, array in volumes.items():
+            single = np.asarray(array, dtype=np.float32)
+            file.create_dataset(name, data=single, compression="gzip", compression_opts=1, shuffle=True)
+            file[name].attrs["unit"] = "1"
+            file[name].attrs["axes"] = "z, x, y"
+
+
+def read_volume(path: Path | str) -> tuple[np.ndarray, VolumeGrid, dict[str, np.ndarray]]:
+    """What ``write_volume`` wrote: ``volume`` [nz, nx, ny] float32, its grid, and the extra datasets by name.
+
+    Raises:
+        UserError: the file is missing, is not HDF5, or holds no volume on a grid.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            origin, pitch = (tuple(float(v) for v in file.attrs[name]) for name in ("origin", "pitch"))
+            volumes = {name: file[name][()] for name in file if name not in AXES}
+            volume = volumes.pop("volume")
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a volume.h5 (a dataset 'volume', its grid as attributes): {error}"
+        ) from error
+    if volume.ndim != 3 or len(origin) != 3 or len(pitch) != 3:
+        raise UserError(
+            f"the volume of {path} must be [nz, nx, ny] with a grid of three axes; found shape {volume.shape}"
+        )
+    return volume, VolumeGrid(origin, pitch, tuple(volume.shape)), volumes

@@ -1,0 +1,1 @@
+"""How well transients and surfaces agree with what was measured or is true."""

@@ -1,0 +1,154 @@
+"""What an experiment leaves: a table, figures, captions, and the comparison in one line each."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from nlos_lit.io.files import whole_file, write_json
+from nlos_lit.report.style import save_figure
+from nlos_lit.training.summary import git_state
+
+Row = dict[str, Any]
+CLASSICAL = ("bp", "fbp", "lct", "dlct", "fk", "rsd")
+
+
+@dataclass(frozen=True)
+class Glance:
+    """One quantity on one capture, for all systems; lower is better unless ``higher`` says otherwise.
+
+    Args:
+        what: the quantity with its unit.
+        data: the capture.
+        published: the paper's own formulation, run here (``model=paper``).
+        classical: value by method of the classical reconstructions.
+        ours: the default model's phasor surface.
+        refined: the surfels.
+    """
+
+    what: str
+    data: str
+    published: float | None = None
+    classical: dict[str, float] = field(default_factory=dict)
+    ours: float | None = None
+    refined: float | None = None
+    higher: bool = False
+
+    def row(self) -> Row:
+        """The comparison as a row of a table; the verdict compares the better of ours with the better of the others."""
+        known = {name: value for name, value in self.classical.items() if _known(value)}
+        sign = -1 if self.higher else 1
+        best = min(known, key=lambda name: sign * known[name]) if known else None
+        mine = [value for value in (self.ours, self.refined) if _known(value)]
+        others = [value for value in (self.published, known.get(best)) if _known(value)]
+        verdict = "–"
+        if mine and others:
+            better, rival = (max, max) if self.higher else (min, min)
+            verdict = compare(better(mine), rival(others), self.higher)
+        return {
+            "quantity": self.what,
+            "data": self.data,
+            "published system": self.published,
+            "best classical": f"{cell(known[best])} ({best})" if best else None,
+            "ours, phasor surface": self.ours,
+            "ours, refined": self.refined,
+            "verdict": verdict,
+        }
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and bool(np.isfinite(value))
+
+
+def compare(mine: float, rival: float, higher: bool) -> str:
+    """How much better ``mine`` is than ``rival``, in words."""
+    if mine <= 0 or rival <= 0:
+        return "–"
+    factor = mine / rival if higher else rival / mine
+    if 0.97 < factor < 1.03:
+        return "equal within 3 %"
+    return f"**better**, {factor:.3g} ×" if factor > 1 else f"worse, {1 / factor:.3g} ×"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A finished experiment.
+
+    Args:
+        name: of the command.
+        title: one line.
+        paper: what the paper shows there, on which data.
+        here: on which data it was measured here, and how.
+        rows: the table.
+        figures: name → figure.
+        captions: name → caption, one for each figure.
+        glance: the comparisons.
+        hidden: columns that only the CSV holds.
+    """
+
+    name: str
+    title: str
+    paper: str
+    here: str
+    rows: list[Row]
+    figures: dict[str, Figure]
+    captions: dict[str, str]
+    glance: list[Glance] = field(default_factory=list)
+    hidden: tuple[str, ...] = ()
+
+    def write(self, folder: Path) -> None:
+        """``table.csv``, ``table.md``, a PNG a figure, and ``evidence.json`` with everything that is text."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write_csv(folder / "table.csv", self.rows)
+        shown = [{key: value for key, value in row.items() if key not in self.hidden} for row in self.rows]
+        (folder / "table.md").write_text(markdown(shown) + "\n", encoding="utf-8")
+        for name, figure in self.figures.items():
+            save_figure(figure, folder / f"{name}.png")
+        texts = {key: getattr(self, key) for key in ("name", "title", "paper", "here", "captions")}
+        comparisons = [entry.row() for entry in self.glance]
+        write_json(
+            folder / "evidence.json", {**texts, "rows": shown, "glance": comparisons, "git": git_state()}
+        )
+
+
+def read_record(folder: Path) -> dict[str, Any]:
+    """What :meth:`Evidence.write` left in ``evidence.json``."""
+    return json.loads((folder / "evidence.json").read_text(encoding="utf-8"))
+
+
+def write_csv(path: Path, rows: list[Row]) -> None:
+    """A header and a line a row, at full precision; columns in the order of their first appearance."""
+    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=columns(rows))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def columns(rows: list[Row]) -> list[str]:
+    """All keys of all rows, in the order of their first appearance."""
+    return list(dict.fromkeys(key for row in rows for key in row))
+
+
+def markdown(rows: list[Row]) -> str:
+    """The rows as a Markdown table, three digits a number."""
+    names = columns(rows)
+    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    lines += ["| " + " | ".join(cell(row.get(name)) for name in names) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def cell(value: Any) -> str:
+    """A table's cell: – where nothing is known."""
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return "–"
+    if isinstance(value, bool):
+        return "✓" if value else "–"
+    if isinstance(value, float):
+        return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
+    return str(value).replace("|", "\\|")

@@ -1,0 +1,91 @@
+"""Trainings that several tables and figures share, and what they left."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+
+from nlos_lit.metrics.geometry import depth_map, geometry_errors
+from nlos_lit.paper.methods import geometry_row
+from nlos_lit.paper.subjects import Size, bunny
+from nlos_lit.paper.workspace import Workspace
+from nlos_lit.training.callbacks import surface_points
+from nlos_lit.training.outcome import shown_spots
+from nlos_lit.training.run_folder import Run, open_run, prepare_run
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """A run's ``summary.json``."""
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def ablated(work: Workspace, size: Size, name: str, seed: int) -> Path:
+    """The training of one row of Table 1; the full model's is refined, too, from the first seed."""
+    settings = [f"ablation={name}", f"seed={seed}"]
+    if name == "all" and seed == size.seeds[0]:
+        settings.append("refine=true")
+    return work.train(f"bunny_{name}_{seed}", bunny(work, size), *settings)
+
+
+def full_model(work: Workspace, size: Size) -> Path:
+    """Table 1's last row, first seed: other experiments look at it, too."""
+    return ablated(work, size, "all", size.seeds[0])
+
+
+VISIBLE = 16  # wall points whose view of the surface is shown
+
+
+def history(folder: Path) -> dict[str, list[float]]:
+    """Imaging parameters after every iteration, as the run's checkpoint keeps them."""
+    state = torch.load(folder / "checkpoints" / "last.ckpt", map_location="cpu", weights_only=True)
+    values = state["callbacks"]["History"]["values"]
+    return {
+        name.removeprefix("parameters/"): v for name, v in values.items() if name.startswith("parameters/")
+    }
+
+
+def untrained(folder: Path) -> Run:
+    """A finished run as it was before its first iteration."""
+    return prepare_run(OmegaConf.to_container(OmegaConf.load(folder / "config.yaml")))
+
+
+@torch.no_grad()
+def state_of(run: Run, spot: int) -> dict[str, Any]:
+    """Volume's front, surface and one transient of a run as it stands."""
+    pipeline, capture = run.module.pipeline, run.capture
+    grid = pipeline.phasor.grid
+    points = surface_points(run.module, capture, shown_spots(capture.n_spots, VISIBLE))
+    rendering = pipeline(torch.tensor([spot]))
+    errors = {}
+    if run.truth is not None:
+        spacing = float(np.abs(grid.pitch[:2]).max())
+        errors = {
+            f"row_{k}": v
+            for k, v in geometry_row(geometry_errors(points, run.truth, lateral_tolerance=spacing)).items()
+        }
+    return {
+        "front": pipeline.phasor().max(0).values.numpy(),
+        "depth": depth_map(points, grid.x, grid.y),
+        "measured": capture.gated_counts()[spot],
+        "rendered": rendering.expected[0].numpy(),
+        "path": capture.path_gate[0] + (np.arange(rendering.expected.shape[1]) + 0.5) * capture.bin_length,
+        "omega_pf": float(pipeline.phasor.omega_pf()),
+        "sigma_pf": float(pipeline.phasor.sigma_pf()),
+        **errors,
+    }
+
+
+def brightest_heldout(run: Run) -> int:
+    """The held-out spot with the most counts."""
+    held = run.data.heldout_spots
+    return int(held[run.capture.gated_counts()[held].sum(1).argmax()])
+
+
+def state_at(folder: Path, when: str) -> dict[str, Any]:
+    run = untrained(folder) if when == "first" else open_run(folder)
+    return state_of(run, brightest_heldout(run))

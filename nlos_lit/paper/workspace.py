@@ -1,0 +1,197 @@
+"""Where experiments keep what is expensive: captures, trainings and arrays, each made once and found again."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import multiprocessing
+import os
+import runpy
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from data_modules.load import load_scene
+from data_modules.simulate import Mesh, load_truth
+from nlos_lit.capture import Capture
+from nlos_lit.capture.aperture import spot_spacing
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.surface_truth import SurfaceTruth
+from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
+from nlos_lit.io.files import whole_file
+
+log = logging.getLogger(__name__)
+
+ROOT = Path(__file__).resolve().parents[2]
+Arrays = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A capture to work on: the settings by which ``train.py`` takes it, and what tables call it."""
+
+    name: str
+    label: str
+    overrides: tuple[str, ...]
+
+    @property
+    def short(self) -> str:
+        """The label up to the number of spots."""
+        return self.label.split(" spots")[0]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A subject, loaded: as ``train.py`` would see it. ``mesh`` and ``truth`` are None where the truth is not known."""
+
+    capture: Capture
+    truth: SurfaceTruth | None
+    mesh: Mesh | None
+    grid: VolumeGrid
+    falloff: float
+    threshold: float
+
+    @functools.cached_property
+    def spacing(self) -> float:
+        """Distance of neighbouring spots, m."""
+        return spot_spacing(self.capture)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """First and last voxel centre along x and along y, m."""
+        x, y = self.grid.x, self.grid.y
+        return float(x[0]), float(x[-1]), float(y[0]), float(y[-1])
+
+
+def run_training(arguments: list[str], output: Path) -> int:
+    """``train.py`` with ``arguments`` in a process of its own; what it prints goes to ``output``. Returns its exit status.
+
+    The process is forked from a server that has imported the libraries and done nothing else: imports take longer than a small
+    training.
+    """
+    server = multiprocessing.get_context("forkserver")
+    server.set_forkserver_preload(
+        ["lightning", "hydra", "open3d", "nlos_lit.training.outcome", "nlos_lit.training.run_folder"]
+    )
+    process = server.Process(target=_train, args=(arguments, output))
+    process.start()
+    try:
+        process.join()
+    except BaseException:
+        process.terminate()
+        process.join()
+        raise
+    return process.exitcode
+
+
+def _train(arguments: list[str], output: Path) -> None:
+    with output.open("w") as file:
+        for stream in (1, 2):
+            os.dup2(file.fileno(), stream)
+    os.chdir(ROOT)
+    sys.argv = [str(ROOT / "train.py"), *arguments]
+    runpy.run_path(sys.argv[0], run_name="__main__")
+
+
+class Workspace:
+    """A folder of results of one size.
+
+    Args:
+        root: where everything goes.
+        experiment: config of conf/experiment that trainings use.
+        data: folders that are searched for captures and meshes.
+    """
+
+    def __init__(self, root: Path, experiment: str, data: Sequence[Path] = ()) -> None:
+        self.root, self.experiment, self.data = Path(root), experiment, [Path(folder) for folder in data]
+
+    def find(self, name: str) -> Path | None:
+        """A file or folder of that name below the data folders; None where there is none."""
+        found = (path for folder in self.data for path in sorted(folder.rglob(name)))
+        return next(found, None)
+
+    def needed(self, name: str) -> Path:
+        """As :meth:`find`.
+
+        Raises:
+            UserError: it is not there.
+        """
+        path = self.find(name)
+        if path is None:
+            places = ", ".join(map(str, self.data)) or "no folder"
+            raise UserError(
+                f"this experiment needs {name}; found none below {places}. Give the folder that holds it: data=DIR"
+            )
+        return path
+
+    def path(self, name: str) -> Path:
+        """A file of the workspace, its folder made."""
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def kept(self, name: str, compute: Callable[[], dict[str, Any]]) -> Arrays:
+        """Named arrays (or numbers), computed once and read from ``kept/NAME.npz`` from then on."""
+        path = self.path(f"kept/{name}.npz")
+        if not path.exists():
+            log.info("computing %s", name)
+            arrays = {key: np.asarray(value) for key, value in compute().items()}
+            with whole_file(path) as partial:
+                np.savez_compressed(partial, **arrays)
+        with np.load(path, allow_pickle=False) as stored:
+            return {key: stored[key] for key in stored.files}
+
+    def train(self, name: str, subject: Subject, *overrides: str, start: Path | None = None) -> Path:
+        """The run folder of a training, trained now unless a finished one is there; an interrupted one goes on.
+
+        Args:
+            overrides: further settings of ``train.py``.
+            start: a finished shorter run to go on from.
+
+        Raises:
+            UserError: the training failed, or the stored one had other settings.
+        """
+        folder = self.root / "runs" / name
+        wanted = [f"experiment={self.experiment}", *subject.overrides, *overrides]
+        stored = folder / ".hydra" / "overrides.yaml"
+        if stored.exists():
+            used = [item for item in yaml.safe_load(stored.read_text()) if not item.startswith("ckpt_path=")]
+            if used != wanted:
+                raise UserError(
+                    f"{folder} was trained with other settings ({used}, now {wanted}); remove it to train anew"
+                )
+        if (folder / "summary.json").exists():
+            return folder
+        checkpoint = []
+        if (folder / "checkpoints" / "last.ckpt").exists():
+            checkpoint = ["ckpt_path=last"]
+        elif start is not None:
+            checkpoint = [f"ckpt_path={start}/checkpoints/last.ckpt"]
+        folder.mkdir(parents=True, exist_ok=True)
+        log.info("training %s", name)
+        output = folder / "output.txt"
+        status = run_training([*wanted, *checkpoint, f"hydra.run.dir={folder.resolve()}"], output)
+        if status:
+            last = output.read_text(errors="replace").strip().splitlines()[-1:]
+            raise UserError(
+                f"the training {name} failed ({' '.join(last)}); all of its output is in {output}"
+            )
+        return folder
+
+    def open(self, subject: Subject, *overrides: str) -> Scene:
+        """The subject's capture, truth and volume."""
+        chosen = [f"experiment={self.experiment}", *subject.overrides, *overrides]
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            config = OmegaConf.to_container(compose("train", overrides=chosen), resolve=True)
+        scene = config["scene"]
+        capture, truth = load_scene(scene, config["data_dir"], config["seed"])
+        mesh = load_truth(scene["truth"]).mesh if scene["truth"] is not None else None
+        grid = volume_grid(capture, **scene["volume"])
+        return Scene(capture, truth, mesh, grid, scene["falloff"], scene["threshold"])

@@ -1,0 +1,1 @@
+"""The answer shown: figures, words, verdict, page."""

@@ -1,0 +1,358 @@
+"""The diagnosis as one page that opens anywhere, as JSON, and as figures."""
+
+from __future__ import annotations
+
+import base64
+import html
+import math
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+from nlos_lit.inference.result import Accepted, Diagnosis
+from nlos_lit.io.files import whole_file, write_json
+from nlos_lit.report.diagnosis_figures import by_gain, diagnosis_figures
+from nlos_lit.report.page_style import CSS
+from nlos_lit.report.quantities import NONE, amount, number, percent, probability, quantity
+from nlos_lit.report.style import save_figure
+from nlos_lit.report.verdict import barely, invisible, misfit, missing, rivals, sureness, tone, verdict
+from nlos_lit.report.words import AXES, describe
+
+CAPTIONS = {
+    "residual_time": "Residual along time, all spots together: how many standard deviations the counts lie above the simulation.",
+    "residual_depth": "Residual along depth.",
+    "residual_wall": "Residual over the wall, as seen from the wall.",
+    "residual_scan": "Residual in the order in which the spots were recorded.",
+    "residual_rate": "Residual against how bright a spot is.",
+    "deviance": "Misfit after each accepted effect, and on spots that nothing was chosen with. Grey: only counting noise is left.",
+    "effects": "Parameters of the accepted effects.",
+    "screening": "What every known effect would explain by itself, before any was accepted.",
+    "detection_limits": "How strong each effect would have to be to show in this capture.",
+    "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted inside it.",
+    "witness_tail": "The direct pulse's own decay against the tail that was fitted inside the gate.",
+}
+FACTS = {
+    "bin_width_ps": "bin width (ps)",
+    "bin_length": "bin length (m of path)",
+    "gate": "gate (bins)",
+    "counts_per_spot": "counts a spot",
+}
+
+
+class Markup(str):
+    """Text that is HTML already; anything else is escaped."""
+
+
+def write_report(
+    diagnosis: Diagnosis, folder: Path | str, extra_figures: Mapping[str, Figure] | None = None
+) -> Path:
+    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png`` into ``folder``; returns the page's path.
+
+    Args:
+        extra_figures: further figures by name, shown at the end.
+
+    Raises:
+        ValueError: an extra figure has the name of one of the diagnosis's own.
+    """
+    folder = Path(folder)
+    own, extra = diagnosis_figures(diagnosis), dict(extra_figures or {})
+    stems = [re.sub(r"[^\w-]+", "_", name) for name in [*own, *extra]]
+    if len(set(stems)) < len(stems):
+        raise ValueError(f"figures must have different names; found {sorted(stems)}")
+    images: dict[str, Markup] = {}
+    for stem, (name, figure) in zip(stems, [*own.items(), *extra.items()], strict=True):
+        path = folder / "figures" / f"{stem}.png"
+        save_figure(figure, path)
+        images[name] = _image(name, path.read_bytes())
+    write_json(folder / "diagnosis.json", diagnosis.to_dict())
+    page = folder / "report.html"
+    with whole_file(page) as partial:
+        partial.write_text(report_html(diagnosis, images, list(extra)), encoding="utf-8")
+    return page
+
+
+def log_figures(folder: Path | str, figures: Mapping[str, Figure]) -> None:
+    """The figures in TensorBoard: an event file in ``folder/tensorboard``."""
+    with SummaryWriter(Path(folder) / "tensorboard") as writer:
+        for name, figure in figures.items():
+            writer.add_figure(f"diagnosis/{name}", figure)
+
+
+def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Iterable[str] = ()) -> str:
+    """The page; ``images`` by figure name, of which ``extra`` go to the end."""
+
+    def shown(*starts: str) -> str:
+        return "".join(
+            image for name, image in images.items() if name.startswith(starts) and name not in set(extra)
+        )
+
+    name = str(diagnosis.capture.get("name", "capture"))
+    found = missing(diagnosis)
+    each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
+    parts = [
+        f'<header><p class="over">Diagnosis of {_text(name)}</p>'
+        f'<h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis, listed=False))}</h1>{each}'
+        f"<p>{_text(sureness(diagnosis))}</p></header>",
+        _misfit_bar(diagnosis),
+        _section("What the simulation was extended with", _accepted(diagnosis)) if diagnosis.effects else "",
+        _section("Why, and what to do on the rig", _remedies(diagnosis))
+        if diagnosis.effects or diagnosis.groups
+        else "",
+        _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
+        _section("What stays unexplained", _unexplained(diagnosis)),
+        _section("Where simulation and measurement differ", shown("residual_")),
+        _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
+        _section("Every known effect, tested", shown("screening") + _screened(diagnosis))
+        if diagnosis.screened
+        else "",
+        _section("What could not have been seen", _limits(diagnosis) + shown("detection_limits"))
+        if diagnosis.screened
+        else "",
+        _section("The direct pulse as witness", _witness(diagnosis) + shown("witness_"))
+        if diagnosis.witness
+        else "",
+        _section("Numerics, not physics", _numerics(diagnosis)) if diagnosis.numerics else "",
+        _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
+        if diagnosis.notes
+        else "",
+        _section("More figures", "".join(images[n] for n in extra)) if extra else "",
+        _section("Capture and run", _facts(diagnosis)),
+    ]
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    title = f"<title>Diagnosis of {_text(name)}</title><style>{CSS}</style>"
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}{title}</head>\n<body>\n'
+        + "\n".join(filter(None, parts))
+        + "\n</body></html>\n"
+    )
+
+
+def _misfit_bar(diagnosis: Diagnosis) -> str:
+    m = misfit(diagnosis)
+    parts = {
+        "noise": ("counting noise", m.noise),
+        "explained": ("explained", m.explained),
+        "unexplained": ("unexplained", m.unexplained),
+    }
+    total = sum(value for _, value in parts.values())
+    if not (math.isfinite(total) and total > 0):
+        return ""
+    shares = {name: 100 * value / total for name, (_, value) in parts.items()}
+    strip = "".join(
+        f'<span class="{name}" style="width:{share:.2f}%"></span>'
+        for name, share in shares.items()
+        if share > 0
+    )
+    keys = "".join(
+        f'<span><i class="{name}"></i>{label} {percent(value / total)} ({number(value)})</span>'
+        for name, (label, value) in parts.items()
+    )
+    where = "spots that nothing was fitted to or chosen with" if m.untouched else "held-out spots"
+    caption = f"<figcaption>Misfit of the simulation as it was (deviance per bin), on {where}.</figcaption>"
+    return f'<figure><div class="bar">{strip}</div><div class="keys">{keys}</div>{caption}</figure>'
+
+
+def _accepted(diagnosis: Diagnosis) -> str:
+    heads = [
+        "Effect",
+        "Size (± standard error)",
+        "Statistic",
+        "p",
+        "Gain on held-out blocks",
+        "May be confused with",
+    ]
+    return _table(heads, [_accepted_row(diagnosis, effect) for effect in diagnosis.effects], "cards")
+
+
+def _accepted_row(diagnosis: Diagnosis, effect: Accepted) -> list[Any]:
+    bin_length = diagnosis.capture.get("bin_length")
+    sizes = []
+    for name, estimate in effect.parameters.items():
+        first, *more = quantity(effect.name, name, estimate, bin_length)
+        also = f"<small>{_text(' = '.join(['', *more]).strip())}</small>" if more else ""
+        sizes.append(f"<div>{_text(name.replace('_', ' '))} <b>{_text(first)}</b> {also}</div>")
+    gain = effect.heldout_gain
+    low, high = gain.ci95
+    held = (
+        f"<b>{number(gain.nats_per_photon)}</b> nats a photon <small>95 %: {number(low)} … {number(high)}</small>"
+        f"<div>deviance per bin {number(gain.deviance_per_bin_before, 4)} → {number(gain.deviance_per_bin_after, 4)}</div>"
+    )
+    others = list(dict.fromkeys([*rivals(diagnosis, effect.name), *effect.confusable_with]))
+    confused = f"{_text(', '.join(others) or 'nothing')}" + (
+        f"<div><small>split by: {_text(effect.split_by)}</small></div>" if effect.split_by else ""
+    )
+    title = f"<b>{_text(describe(effect.name).phrase)}</b> <small>{_text(effect.name)}</small>"
+    numbers = [number(effect.statistic), probability(effect.p_value)]
+    return [Markup(title), Markup("".join(sizes) or NONE), *numbers, Markup(held), Markup(confused)]
+
+
+def _remedies(diagnosis: Diagnosis) -> str:
+    names = dict.fromkeys(
+        [*(e.name for e in diagnosis.effects), *(n for group in diagnosis.groups for n in group)]
+    )
+    words = [(describe(n), n) for n in names]
+    return (
+        "<dl>"
+        + "".join(
+            f"<dt>{_text(_capital(w.phrase))} <small>{_text(n)}</small></dt><dd>{_text(w.cause)} <b>{_text(w.remedy)}</b></dd>"
+            for w, n in words
+        )
+        + "</dl>"
+    )
+
+
+def _groups(diagnosis: Diagnosis) -> str:
+    items = []
+    for group in diagnosis.groups:
+        splits = [e.split_by for e in diagnosis.effects if e.name in group and e.split_by]
+        how = f" – split by: {'; '.join(dict.fromkeys(splits))}" if splits else ""
+        items.append(f"<li>{_text(' or '.join(f'{describe(n).phrase} ({n})' for n in group) + how)}</li>")
+    return f"<p>These leave nearly the same trace in this capture.</p><ul>{''.join(items)}</ul>"
+
+
+def _unexplained(diagnosis: Diagnosis) -> str:
+    left = diagnosis.unexplained
+    axis = AXES.get(left.axis, left.axis) or "on any axis"
+    what = f"Significant, {axis}" if left.significant else f"Nothing significant; the largest rest is {axis}"
+    return f"<p>{_text(what)}: statistic {number(left.statistic)}, p = {probability(left.p_value)}.</p>"
+
+
+def _scores(diagnosis: Diagnosis) -> str:
+    rows = {"held-out, base": diagnosis.base, "held-out, extended": diagnosis.extended}
+    rows |= {f"untouched test, {name}": scores for name, scores in diagnosis.untouched_test.items()}
+    heads = ["Spots", "Deviance per bin", "of which noise", "Transient NMSE", "of which noise"]
+    return _table(
+        heads,
+        [
+            [n, *(number(v, 4) for v in (s.deviance_per_bin, s.deviance_noise, s.nmse, s.nmse_noise))]
+            for n, s in rows.items()
+        ],
+    )
+
+
+def _screened(diagnosis: Diagnosis) -> str:
+    bin_length, accepted = diagnosis.capture.get("bin_length"), {e.name for e in diagnosis.effects}
+    rows = []
+    for one in by_gain(diagnosis.screened):
+        step = {**one.one_step, **one.shape}
+        sizes = ", ".join(
+            f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in step.items()
+        )
+        kept = percent(one.retained_information) + (" (barely identifiable)" if barely(one) else "")
+        title = Markup(
+            f"{_text(one.name)}{' <b>✔</b>' if one.name in accepted else ''}<br><small>{_text(describe(one.name).phrase)}</small>"
+        )
+        rows.append(
+            [
+                title,
+                number(one.statistic),
+                one.degrees,
+                probability(one.p_value),
+                kept,
+                number(one.predicted_gain),
+                sizes or NONE,
+            ]
+        )
+    heads = [
+        "Effect",
+        "Statistic",
+        "Parameters",
+        "p",
+        "Retained information",
+        "Predicted gain (nats)",
+        "First estimate",
+    ]
+    kept = "what is left of an effect's trace once scene, albedo and response have adapted"
+    rule = "A small p alone is not enough: an accepted effect also gains on held-out blocks, and beats its rivals."
+    return f"<p>Ranked by predicted gain. ✔ accepted. {rule} Retained information: {kept}.</p>" + _table(
+        heads, rows
+    )
+
+
+def _limits(diagnosis: Diagnosis) -> str:
+    bin_length, rows = diagnosis.capture.get("bin_length"), []
+    for one in sorted(diagnosis.screened, key=lambda s: (not invisible(s), not barely(s))):
+        limits = ", ".join(
+            f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in one.detectable.items()
+        )
+        remark = (
+            "barely identifiable: scene, albedo and response can imitate nearly all of it"
+            if barely(one)
+            else ""
+        )
+        rows.append([one.name, "at no possible strength" if invisible(one) else limits or NONE, remark])
+    return _table(["Effect", "Would have been seen from", "Remark"], rows)
+
+
+def _witness(diagnosis: Diagnosis) -> str:
+    w, rows = diagnosis.witness or {}, []
+    if w.get("direct_pulse_counts") is not None:
+        rows.append(["Counts of the direct pulse", f"{w['direct_pulse_counts']:,.0f}"])
+    r, fitted, direct = (
+        w.get("wall_gain_correlation"),
+        w.get("tail_decay_fitted_m"),
+        w.get("tail_decay_direct_m"),
+    )
+    if r is not None:
+        rows.append(["Correlation of the fitted wall gain with it (1: the same, 0: unrelated)", number(r)])
+    if fitted is not None:
+        rows.append(["Decay of the fitted tail", amount("irf_tail", "decay", fitted, None)])
+    if direct:
+        rows.append(
+            [
+                "Decay of the direct pulse, early to late",
+                " … ".join(amount("irf_tail", "decay", v, None) for v in direct),
+            ]
+        )
+    return "<p>It lies outside the gate; no fit has used it.</p>" + _table(["Witness", "Value"], rows)
+
+
+def _numerics(diagnosis: Diagnosis) -> str:
+    rows = [[name.replace("_", " "), number(value)] for name, value in diagnosis.numerics.items()]
+    heads = ["Varied", "Change of the deviance per bin (held-out spots)"]
+    return "<p>What moves when only the computation is varied is not physics.</p>" + _table(heads, rows)
+
+
+def _facts(diagnosis: Diagnosis) -> str:
+    facts = {FACTS.get(k, k.replace("_", " ")): v for k, v in diagnosis.capture.items()}
+    facts |= {"seed": diagnosis.seed, "toys": diagnosis.toys, "time taken (s)": diagnosis.seconds}
+    return _table(
+        ["Fact", "Value"], [[k, f"{v:.6g}" if isinstance(v, float) else str(v)] for k, v in facts.items()]
+    )
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>" if body else ""
+
+
+def _table(heads: list[str], rows: Iterable[list[Any]], style: str = "") -> str:
+    top = "".join(f"<th>{_text(h)}</th>" for h in heads)
+    lines = (
+        "".join(f'<td data-label="{_text(h)}">{_text(cell)}</td>' for h, cell in zip(heads, row, strict=True))
+        for row in rows
+    )
+    return (
+        f'<div class="wide"><table class="{style}"><thead><tr>{top}</tr></thead><tbody><tr>'
+        + "</tr><tr>".join(lines)
+        + "</tr></tbody></table></div>"
+    )
+
+
+def _image(name: str, png: bytes) -> Markup:
+    base = CAPTIONS.get(name) or CAPTIONS.get(re.sub(r"_\d+$", "", name)) or name.replace("_", " ")
+    data = base64.b64encode(png).decode("ascii")
+    return Markup(
+        f'<figure><img alt="{_text(base)}" src="data:image/png;base64,{data}"><figcaption>{_text(base)}</figcaption></figure>'
+    )
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, Markup) else html.escape(str(value))

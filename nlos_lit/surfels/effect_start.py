@@ -1,0 +1,65 @@
+"""Where scanned parameters of effects (delays, decays, periods) start: on their grids, where the counts ask for them most."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
+from nlos_lit.surfels.model import SurfelModel
+
+
+@torch.no_grad()
+def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor) -> None:
+    """Set every effect that has scanned parameters to the best of its grid, its amplitudes to one scoring step from their null.
+
+    The step x maximises ``g·x - x·F x/2``, within bounds, with ``g = Σ (H/μ - 1) ∂μ/∂x`` and ``F = Σ ∂μ/∂x ∂μ/∂x / μ``; the best
+    grid point is that of the largest maximum. Surfels and other effects are held, so this is a start and not a test. An effect that
+    gains nothing anywhere is left at the null in the middle of its grid.
+
+    Args:
+        spots: ``[B]``. counts: ``[B, T_gate]`` of them.
+    """
+
+    def arriving() -> Tensor:
+        return torch.cat([model.transients(model.paths(part), part, extension) for part in spots.split(32)])
+
+    def expected(effect: Effect, light: Tensor) -> Tensor:
+        transients = arriving() if effect.needs_paths else light
+        return model.record(transients, spots, extension)[:, model.gate[0] :].clamp_min(1e-9)
+
+    light = arriving()
+    for effect in extension.effects:
+        if not effect.shapes:
+            continue
+        effect.reset()
+        base = expected(effect, light)
+        excess = counts / base - 1
+        best, most = {}, 0.0
+        for shape in effect.shape_grid():
+            effect.set_all(shape)
+            columns = []
+            for p in effect.amplitudes:
+                effect.set(p.name, p.null + p.scale)
+                columns.append((expected(effect, light) - base) / p.scale)
+                effect.set(p.name, p.null)
+            sensitivity = torch.stack(columns).flatten(1).double()
+            score = sensitivity @ excess.flatten().double()
+            information = (sensitivity / base.flatten()) @ sensitivity.T
+            if float(information.diagonal().min()) <= 0:  # nothing in the gate changes
+                continue
+            step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0]
+            low, high = (
+                torch.tensor([getattr(p, b) - p.null for p in effect.amplitudes]) for b in ("lower", "upper")
+            )
+            step = step.clamp(low, high)
+            gain = float(score @ step - step @ information @ step / 2)
+            if gain > most:
+                best = shape | {
+                    p.name: p.null + float(x) for p, x in zip(effect.amplitudes, step, strict=True)
+                }
+                most = gain
+        effect.reset()
+        effect.set_all(best)
+        light = arriving() if effect.needs_paths else light

@@ -1,0 +1,258 @@
+"""The hidden surface as surfels, and the measurement they predict."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from nlos_lit.capture import Capture
+from nlos_lit.effects.hooks import NOTHING, Hooks
+from nlos_lit.functional.irf import convolve_time
+from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
+from nlos_lit.functional.surfel_paths import SPLINE_VARIANCE, STEEP, Paths, SplineSplat, quadrature, trace
+from nlos_lit.io.points import Points
+from nlos_lit.model.laser_sensor import LaserSensor
+from nlos_lit.model.parameters import BoundedParameter
+
+
+class Lateral(NamedTuple):
+    """The lattice of lateral cells on which the front sheet is kept for the visibility test."""
+
+    origin: tuple[float, float]  # centre of cell [0, 0], m
+    pitch: tuple[float, float]  # signed, m
+    shape: tuple[int, int]
+
+
+class SurfelModel(nn.Module):
+    """Surfels with place, normal and albedo, and the laser-sensor response.
+
+    Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for that. "Depth" is the
+    place along it. State dicts are complete: :meth:`from_state` rebuilds the model with its number of surfels.
+
+    Args:
+        capture: for its wall points and time axis; its counts are not kept.
+        centre: ``[M, 3]`` m. normal: ``[M, 3]`` towards the wall's side. albedo: ``[M]`` > 0.
+        lateral: cells of the surfels.
+        laser_sensor: from :func:`spline_sensor`.
+        quadrature: points along each side of a surfel.
+    """
+
+    visible: Tensor
+
+    def __init__(
+        self,
+        capture: Capture,
+        *,
+        centre: Tensor,
+        normal: Tensor,
+        albedo: Tensor,
+        lateral: Lateral,
+        laser_sensor: LaserSensor,
+        quadrature: int = 2,
+    ) -> None:
+        super().__init__()
+        self.gate, self.n_bins = capture.gate, capture.gate[1]
+        self.bin_length, self.t_start, self.confocal = capture.bin_length, capture.t_start, capture.confocal
+        self.laser_sensor, self.quadrature, self.lateral = laser_sensor, quadrature, lateral
+        for name in ("laser", "sensor", "laser_normal", "sensor_normal"):
+            self.register_buffer(
+                name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False
+            )
+        cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
+        self.register_buffer("cell", cell, persistent=False)
+        self.place(centre, normal, albedo)
+
+    def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
+        """Replace all surfels; they see every spot until :meth:`update_visibility`."""
+        device = self.laser.device
+        normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
+        steep = -normal[:, 2:] < STEEP
+        self.register_buffer("anchor", centre.to(device=device, dtype=torch.float32))
+        self.register_buffer(
+            "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
+        )
+        self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
+        # In units of a bin there and back, so that one learning rate suits every capture.
+        self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
+        self.raw_normal = nn.Parameter(normal)
+        self.raw_albedo = nn.Parameter(
+            inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
+        )
+        self.link()
+
+    def centre(self) -> Tensor:
+        """``[M, 3]`` m."""
+        return self.anchor + (self.raw_depth * (self.bin_length / 2))[:, None] * self.direction
+
+    def normal(self) -> Tensor:
+        """``[M, 3]`` unit, towards the wall's side."""
+        return torch.nn.functional.normalize(self.raw_normal, dim=1)
+
+    def albedo(self) -> Tensor:
+        """``[M]`` ≥ 0, relative to the response's intensity."""
+        return torch.nn.functional.softplus(self.raw_albedo)
+
+    @torch.no_grad()
+    def set_albedo(self, albedo: Tensor) -> None:
+        """Store albedos ``[M]``, in place."""
+        self.raw_albedo.copy_(inverse_softplus(albedo.clamp_min(1e-7)))
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+    @torch.no_grad()
+    def link(self) -> None:
+        """Find each surfel's neighbours on its sheet, for :meth:`bending`."""
+        normal = self.normal()
+        stretch = (1 / (-normal[:, 2]).clamp_min(STEEP)).clamp_max(2.0)
+        self.pairs = neighbour_pairs(self.centre(), normal, 1.6 * self.cell.max() * stretch)
+
+    def bending(self) -> Tensor:
+        """How badly normals and places of neighbours fit one surface, in squared radians summed over pairs."""
+        albedo = self.albedo().detach()
+        return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
+
+    def presence(self) -> Tensor:
+        """How many surfels there are, each counted as a/(a + ε) with ε a tenth of the mean albedo a: the weak ones feel it most."""
+        albedo = self.albedo()
+        return (albedo / (albedo + 0.1 * albedo.detach().mean())).sum()
+
+    @torch.no_grad()
+    def update_visibility(self, opaque: float = 0.3, skip: float = 1.5, samples: int = 32) -> None:
+        """Find from which wall points each surfel's centre is hidden by the front sheet of the others.
+
+        Args:
+            opaque: surfels of at least this share of the mean albedo hide. skip: cells before the surfel that do not.
+            samples: along each line of sight.
+        """
+        albedo, centre = self.albedo(), self.centre()
+        solid = albedo > opaque * albedo.mean()
+        cells = self.lateral
+        origin, pitch = (
+            torch.tensor(v, dtype=torch.float32, device=centre.device) for v in (cells.origin, cells.pitch)
+        )
+        index = ((centre[solid, :2] - origin) / pitch).round().long()
+        sheet = front_sheet(index, centre[solid, 2], cells.shape)
+
+        def seen(wall: Tensor) -> Tensor:
+            points, row = torch.unique(wall, dim=0, return_inverse=True)
+            return clear_view(sheet, origin, pitch, points, centre, samples, skip)[row]
+
+        self.visible = seen(self.laser)
+        if not self.confocal:
+            self.visible &= seen(self.sensor)
+
+    def paths(self, spots: Tensor) -> Paths:
+        """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
+        walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
+        offsets = quadrature(self.quadrature, self.anchor.device)
+        paths = trace(self.centre(), self.normal(), self.cell, offsets, *walls, self.confocal)
+        if len(self.visible):
+            paths = paths._replace(contribution=paths.contribution * self.visible[spots][:, :, None])
+        return paths
+
+    def arrival(self, length: Tensor) -> Tensor:
+        """Stage 2: path length (m) as time in bins from the capture's bin 0."""
+        return (length - self.t_start) / self.bin_length
+
+    def transients(self, paths: Paths, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stages 2 and 3: ``[B, T]`` light on arrival, H_r."""
+        energy, length = (
+            hooks.path(paths.contribution * self.albedo()[:, None], paths, spots),
+            hooks.time(paths.length, paths, spots),
+        )
+        transients = SplineSplat.apply(energy.flatten(1), self.arrival(length).flatten(1), self.n_bins)
+        return hooks.transients(transients, energy, paths, spots)
+
+    def signal(self, transients: Tensor, hooks: Hooks) -> Tensor:
+        """Stage 4: ``[B, T]`` transients through the response, counts."""
+        sensor = self.laser_sensor
+        return sensor.intensity() * convolve_time(
+            transients, hooks.response(sensor.kernel(), sensor.lead), sensor.lead
+        )
+
+    def detect(self, signal: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stage 5: ``[B, T]`` expected counts: gain → background → counting."""
+        background = hooks.background(self.laser_sensor.background(), spots)
+        return hooks.counting(hooks.gain(signal, spots) + background, spots)
+
+    def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
+        """Stages 4 and 5."""
+        return self.detect(self.signal(transients, hooks), spots, hooks)
+
+    def render(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+        """``[B, T_gate]`` expected counts of ``spots`` ``[B]``."""
+        transients = self.transients(self.paths(spots), spots, hooks)
+        return self.record(transients, spots, hooks)[:, self.gate[0] :]
+
+    forward = render
+
+    @torch.no_grad()
+    def expected(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+        """:meth:`render` without gradients, in batches of about two million paths."""
+        return torch.cat([self.render(part, hooks) for part in self._batches(spots)])
+
+    @torch.no_grad()
+    def light(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+        """``[B, T_gate]`` counts of the light by itself, before background and counting effects."""
+        parts = self._batches(spots)
+        signals = [hooks.gain(self.signal(self.transients(self.paths(p), p, hooks), hooks), p) for p in parts]
+        return torch.cat(signals)[:, self.gate[0] :]
+
+    def _batches(self, spots: Tensor) -> tuple[Tensor, ...]:
+        return spots.split(max(1, (1 << 21) // max(1, len(self) * self.quadrature**2)))
+
+    def points(self) -> Points:
+        """Surfel centres with normals and albedo."""
+        arrays = (self.centre(), self.normal(), self.albedo())
+        return Points(*(a.detach().cpu().double().numpy() for a in arrays))
+
+    def get_extra_state(self) -> dict[str, Any]:
+        response = {name: (p.lower, p.upper, p.unit) for name, p in self.laser_sensor.named_children()}
+        return {"response": response, "quadrature": self.quadrature, "lateral": tuple(self.lateral)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self.quadrature = state["quadrature"]
+
+    @classmethod
+    def from_state(cls, capture: Capture, state: dict[str, Any]) -> SurfelModel:
+        """The model whose ``state_dict()`` this is, over the same capture."""
+        extra = state["_extra_state"]
+        middle = {
+            name: (math.sqrt(low * high), low, high, unit)
+            for name, (low, high, unit) in extra["response"].items()
+        }
+        sensor = spline_sensor(capture, {name: BoundedParameter(*values) for name, values in middle.items()})
+        m = len(state["anchor"])
+        normal = torch.tensor([0.0, 0.0, -1.0]).expand(m, 3)
+        lateral = Lateral(*(tuple(v) for v in extra["lateral"]))
+        model = cls(
+            capture,
+            centre=state["anchor"],
+            normal=normal,
+            albedo=torch.ones(m),
+            lateral=lateral,
+            laser_sensor=sensor,
+        )
+        model.visible = torch.empty_like(state["visible"])
+        model.load_state_dict(state)
+        model.link()
+        return model
+
+
+def spline_sensor(capture: Capture, parameters: dict[str, BoundedParameter]) -> LaserSensor:
+    """A laser-sensor model for transients splatted by cubic B-splines, whose width it takes out of Ψ.
+
+    σ_ls cannot be below √(1/3 + 0.05²) = 0.58 bins.
+    """
+    sensor = LaserSensor(bin_length=capture.bin_length, n_bins=capture.gate[1], **parameters)
+    sensor.splat_variance = SPLINE_VARIANCE
+    return sensor
+
+
+def inverse_softplus(value: Tensor) -> Tensor:
+    """x with softplus(x) = value > 0."""
+    return value + torch.log(-torch.expm1(-value))

@@ -1,0 +1,168 @@
+"""The LightningModule: which parameters are optimised, by which loss, at which rate."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+
+from nlos_lit.functional.sharded import leave_buffers
+from nlos_lit.metrics.transients import expected_deviance, nmse_noise_floor, poisson_deviance
+from nlos_lit.model.objective import Objective, adam, parameter_groups
+from nlos_lit.model.pipeline import Pipeline
+
+log = logging.getLogger(__name__)
+
+
+class SelfCalibration(L.LightningModule):
+    """Minimise Eq. 11-14 over Θ = {Θ_pf, Θ_ls, Θ_G}.
+
+    One epoch is one iteration (one batch of spots), so that every checkpoint lies between two optimiser steps and a resumed
+    run repeats the uninterrupted one.
+
+    Args:
+        pipeline: the simulated measurement, its phasor field prepared (or by ``prepare``).
+        scale: counts that the loss counts as 1.
+        optimise: which of ``phasor``, ``sensor``, ``albedo`` are fitted; the others keep their start values.
+        rates: learning rate per group, on the unconstrained parameters.
+        lambda_sparsity, lambda_albedo: λ1 and λ2.
+        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes all.
+        clip: largest joint gradient norm; None does not clip.
+        seed: of the batches of voxels.
+        prepare: makes the phasor field once the processes that share it know each other; None where it is made.
+    """
+
+    def __init__(
+        self,
+        pipeline: Pipeline,
+        scale: float,
+        *,
+        optimise: dict[str, bool],
+        rates: dict[str, float],
+        lambda_sparsity: float,
+        lambda_albedo: float,
+        albedo_planes: int | None = None,
+        clip: float | None = None,
+        seed: int = 0,
+        prepare: Callable[[], None] | None = None,
+    ) -> None:
+        super().__init__()
+        self.pipeline, self.scale, self.rates, self.clip = pipeline, scale, rates, clip
+        self.criterion = Objective(scale, lambda_sparsity, lambda_albedo, albedo_planes, seed)
+        self.optimised = [name for name in parameter_groups(pipeline) if optimise[name]]
+        self.scores: dict[str, dict[str, float]] = {}
+        self._prepare = prepare
+        self._freeze()
+
+    def setup(self, stage: str) -> None:
+        if self._prepare is not None:
+            self.pipeline.to(self.trainer.strategy.root_device)
+            self._prepare()
+            self._prepare = None
+            self._freeze()  # matching the energy makes a new parameter
+        leave_buffers(self)
+
+    def imaging_parameters(self) -> dict[str, dict[str, Any]]:
+        """The six imaging parameters by the paper's names: ``{name: {"value", "unit"}}``."""
+        phasor, sensor = self.pipeline.phasor, self.pipeline.laser_sensor
+        parameters = {
+            "omega_pf": phasor.omega_pf,
+            "sigma_pf": phasor.sigma_pf,
+            "sigma_ls": sensor.sigma_ls,
+            "I_l": sensor.intensity,
+            "kappa_s": sensor.kappa_s,
+            "eta_s": sensor.background,
+        }
+        return {name: {"value": float(p().detach()), "unit": p.unit} for name, p in parameters.items()}
+
+    def objective(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Loss terms of a batch: ``spots`` ``[S]`` and gated ``counts`` ``[S, T]``."""
+        return self.criterion.terms(self.pipeline, batch["spots"], batch["counts"], self.global_step)
+
+    def regularisation(self, intensity: Tensor, albedo: Tensor) -> dict[str, Tensor]:
+        """E_Ipf and E_ρ with their factors, over a volume and (planes of) an albedo volume."""
+        return self.criterion.regularisation(intensity, albedo)
+
+    def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> dict[str, Tensor]:
+        terms = self.objective(batch)
+        if self.global_step % 10 == 0 and self.pipeline.geometry.renew_capacity():
+            log.warning(
+                "iteration %d: more rays met a surface than there was room for; some were left out",
+                self.global_step,
+            )
+        for name, value in terms.items():
+            label = "loss/total" if name == "loss" else f"loss/{name}"
+            self.log(label, value.detach(), on_step=False, on_epoch=True, sync_dist=True, batch_size=1)
+        return terms
+
+    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        self._add_score(batch)
+
+    def on_validation_epoch_start(self) -> None:
+        self.pipeline.phasor.hold()
+        self._sums = torch.zeros(6, dtype=torch.float64, device=self.device)
+
+    def on_validation_epoch_end(self) -> None:
+        for name, value in self._finish_score().items():
+            self.log(f"heldout/{name}", value)
+
+    @torch.no_grad()
+    def score(self, batches: Any) -> dict[str, float]:
+        """NMSE, deviance per bin and their noise levels over this rank's ``batches``, summed over ranks."""
+        self.on_validation_epoch_start()
+        for batch in batches:
+            self._add_score({name: value.to(self.device) for name, value in batch.items()})
+        return self._finish_score()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return adam(self.pipeline, self.rates, self.optimised)
+
+    def configure_gradient_clipping(self, optimizer: torch.optim.Optimizer, *_: Any, **__: Any) -> None:
+        if self.clip is not None:
+            self.clip_gradients(optimizer, gradient_clip_val=self.clip, gradient_clip_algorithm="norm")
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["scores"] = self.scores
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.scores = checkpoint["scores"]
+
+    def _freeze(self) -> None:
+        """What is not optimised keeps its value."""
+        self.groups = parameter_groups(self.pipeline)
+        for name, parameters in self.groups.items():
+            for parameter in parameters:
+                parameter.requires_grad_(name in self.optimised)
+
+    def _add_score(self, batch: dict[str, Tensor]) -> None:
+        counts, expected = batch["counts"], self.pipeline(batch["spots"]).expected
+        noise = expected_deviance(expected) * counts.numel()
+        floor = nmse_noise_floor(counts) * (counts.double() ** 2).sum()
+        self._sums += torch.stack(
+            [
+                ((counts - expected).double() ** 2).sum(),
+                (counts.double() ** 2).sum(),
+                floor,
+                poisson_deviance(counts, expected).sum(),
+                noise,
+                torch.tensor(float(counts.numel()), dtype=torch.float64, device=counts.device),
+            ]
+        )
+
+    def _finish_score(self) -> dict[str, float]:
+        self.pipeline.phasor.release()
+        sums = self._sums
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.all_reduce(sums)
+        error, energy, floor, deviance, noise, bins = sums.tolist()
+        return {
+            "nmse": error / energy,
+            "nmse_noise_floor": floor / energy,
+            "mse": error / bins / self.scale**2,
+            "deviance_per_bin": deviance / bins,
+            "deviance_noise": noise / bins,
+        }

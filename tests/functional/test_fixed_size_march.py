@@ -1,0 +1,107 @@
+"""The march with tensors of fixed size against the other one, and an iteration that never needs a value on the host."""
+
+from __future__ import annotations
+
+import literal
+import pytest
+import torch
+from literal_scenes import CASES, NAMES, build
+
+from nlos_lit.functional.fixed_size_march import compact
+from nlos_lit.model.objective import Objective, adam
+
+RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}
+CRITERION = Objective(400.0, 0.01, 0.005, albedo_planes=5, seed=3)
+
+
+def world(name: str):
+    made = build(CASES[name])
+    phasor = made.pipeline.phasor
+    phasor.prepare(made.capture, phasor.plan(made.capture, 1 << 32))
+    made.counts = torch.from_numpy(made.capture.gated_counts())[made.spots]
+    made.pipeline.geometry.fine, made.pipeline.geometry.relative = 4, True
+    return made
+
+
+def loss_and_gradients(made):
+    terms = CRITERION.terms(made.pipeline, made.spots, made.counts, 0)
+    return terms, torch.autograd.grad(terms["loss"], [made.raw[name] for name in NAMES])
+
+
+def test_compact_by_hand():
+    mask = torch.tensor([False, True, True, False, True])
+    places, used, needed = compact(mask, 4)
+    assert (places.tolist(), used.tolist(), needed.tolist()) == ([1, 2, 4, 0], [True, True, True, False], [3])
+    places, used, needed = compact(mask, 2)
+    assert (places.tolist(), used.tolist(), needed.tolist()) == ([1, 2], [True, True], [3])
+
+
+@pytest.mark.parametrize("name", ["fine", "confocal, mirrored", "one sensor", "one laser", "refined"])
+def test_fixed_sizes_change_nothing(name):
+    made = world(name)
+    expected, gradients = loss_and_gradients(made)
+    surface = made.pipeline(made.spots).surface
+    made.pipeline.geometry.wants_static = True
+    found, static_gradients = loss_and_gradients(made)
+    static = made.pipeline(made.spots).surface
+    real = static.normal.abs().sum(1) > 0
+    order, other = (
+        (s.spot * 1e4 + s.distance.double()).argsort()
+        for s in (surface, type(static)(*(f[real] for f in static)))
+    )
+    assert int(real.sum()) == len(surface.spot) > 50
+    for field, mine in zip(surface, static, strict=True):
+        assert torch.allclose(field[order].double(), mine[real][other].double(), atol=2e-6)
+    for key, value in expected.items():
+        assert found[key].item() == pytest.approx(value.item(), rel=1e-5)
+    for mine, gradient in zip(static_gradients, gradients, strict=True):
+        assert literal.relative(mine, gradient) < 1e-4
+
+
+def test_too_little_room_is_noticed_and_made():
+    made = world("fine")
+    geometry = made.pipeline.geometry
+    geometry.wants_static = True
+    whole = made.pipeline(made.spots).expected
+    assert not geometry.renew_capacity()
+    geometry.capacity = (40.0, 30.0)
+    part = made.pipeline(made.spots).expected
+    assert part.sum() < 0.9 * whole.sum()
+    assert torch.isfinite(part).all()
+    assert geometry.renew_capacity()
+    assert torch.allclose(made.pipeline(made.spots).expected, whole, rtol=1e-5)
+    assert not geometry.renew_capacity()
+
+
+def test_an_iteration_needs_no_value_on_the_host(monkeypatch):
+    """On the meta device tensors have no values: whatever waits for one fails, and so does a copy of numbers from the host."""
+    made = world("fine")
+    made.pipeline.geometry.wants_static = True
+    loss_and_gradients(made)  # finds the capacity
+    pipeline = made.pipeline.to("meta")
+    optimiser = adam(pipeline, RATES, list(RATES))
+    made_on_host = torch.tensor
+
+    def refuse(data, *args, device=None, **kwargs):
+        assert device is None or torch.device(device).type == "cpu", (
+            "numbers copied from the host in an iteration"
+        )
+        return made_on_host(data, *args, device=device, **kwargs)
+
+    monkeypatch.setattr(torch, "tensor", refuse)
+    monkeypatch.setattr(
+        torch.Tensor, "new_tensor", lambda *_: pytest.fail("numbers copied from the host in an iteration")
+    )
+    for step in range(2):
+        optimiser.zero_grad()
+        CRITERION.terms(pipeline, made.spots.to("meta"), made.counts.to("meta"), step)["loss"].backward()
+        optimiser.step()
+    assert pipeline.phasor.omega_pf.raw.grad.device.type == "meta"
+
+
+def test_the_other_march_would_wait():
+    """The check above can fail: the march with sizes of its own needs values."""
+    made = world("fine")
+    made.pipeline.geometry.wants_static = False
+    with pytest.raises((NotImplementedError, RuntimeError), match="Meta tensors"):
+        CRITERION.terms(made.pipeline.to("meta"), made.spots.to("meta"), made.counts.to("meta"), 0)

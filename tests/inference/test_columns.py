@@ -1,0 +1,213 @@
+"""Columns of the least-squares problem against central differences of the model's own render."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator
+
+import pytest
+import torch
+from inference_scenes import (
+    FORWARD_MODE,
+    capture_of,
+    double_precision,
+    effect_of,
+    hide_some,
+    scattered,
+    surfels,
+    uneven,
+)
+from torch import Tensor
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.joint_step import copy_effects
+from nlos_lit.inference.problem import (
+    TILT_PRIOR,
+    acting_order,
+    build_problem,
+    effect_columns,
+    tilt_fields,
+    weighted_columns,
+)
+from nlos_lit.surfels.model import SurfelModel, inverse_softplus
+
+pytestmark = FORWARD_MODE
+FINE, ROUGH = 1e-4, 2e-2  # steps; the response's kernel is rounded to single precision
+ACCEPTED = {
+    "none": {},
+    "gain and pile-up": {"vignetting": {"strength": 0.3}, "pile_up": {"detections": 0.5}},
+    "falloff, tail and background": {
+        "retroreflection": {"falloff": 3.2, "cosine": 0.7},
+        "irf_tail": {"fraction": 0.2, "decay": 0.15},
+        "background_slope": {"slope": 0.5},
+    },
+}
+
+
+@pytest.fixture(autouse=True)
+def _sharp() -> Iterator[None]:
+    yield from double_precision()
+
+
+def setting(
+    kind: str, accepted: str = "none", number: int = 12, spots: int = 10
+) -> tuple[SurfelModel, Extension, Scan, Tensor]:
+    scene = capture_of(scattered(spots), kind)
+    model, scan = surfels(scene, number).double(), Scan.of(scene)
+    hide_some(model)
+    extension = Extension(
+        [effect_of(name, scan, **values) for name, values in ACCEPTED[accepted].items()]
+    ).double()
+    return model, extension, scan, torch.tensor([7, 0, 3, 8])
+
+
+def slope(model: SurfelModel, extension: Extension, spots: Tensor, change: Callable, h: float) -> Tensor:
+    """``[S·bins]`` derivative of the render when ``change(model, extension, step)`` acts in place on copies."""
+    ends = []
+    for step in (h, -h):
+        both = copy.deepcopy(model), copy.deepcopy(extension)
+        with torch.no_grad():
+            change(*both, step)
+        ends.append(both[0].expected(spots, both[1]))
+    return ((ends[0] - ends[1]) / (2 * h)).reshape(-1)
+
+
+def unit(n: int, k: int) -> Tensor:
+    return torch.eye(n)[k]
+
+
+@pytest.mark.parametrize("accepted", ACCEPTED)
+@pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
+def test_nuisance_is_the_slope_of_the_render(kind, accepted):
+    """Albedos in units of themselves, depths in bins, tilts of all normals, response, effects accepted before."""
+    model, extension, _, spots = setting(kind, accepted)
+    m = len(model)
+    counts = torch.full((4, 58), 3.0)
+    problem = build_problem(model, extension, spots, counts)
+    albedo = model.albedo().detach()
+    size = torch.maximum(albedo, 0.05 * albedo.mean())
+    normal = model.normal().detach()
+    # Leaning x: the direction along the surfel that is nearest to x; y: perpendicular to both.
+    across = torch.tensor([1.0, 0, 0]) - normal[:, :1] * normal
+    across = across / across.norm(dim=1, keepdim=True)
+    lean = (across, torch.linalg.cross(normal, across))
+    changes: list[Callable] = []
+    for k in range(m):
+        changes.append(
+            lambda mo, ex, h, k=k: mo.raw_albedo.copy_(inverse_softplus(albedo + h * size * unit(m, k)))
+        )
+    for k in range(m):
+        changes.append(lambda mo, ex, h, k=k: mo.raw_depth.add_(h * unit(m, k)))
+    for direction in lean:
+        changes.append(lambda mo, ex, h, d=direction: mo.raw_normal.copy_(normal + h * d))
+    for name in ("sigma_ls", "kappa_s", "intensity", "background"):
+        changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
+    for k, effect in enumerate(extension.effects):
+        for p in effect.declared:
+            changes.append(lambda mo, ex, h, k=k, p=p: getattr(ex.effects[k], f"raw_{p}").add_(h))
+    expected = model.expected(spots, extension)
+    ours = problem.nuisance * expected.reshape(-1, 1).sqrt()
+    assert ours.shape == (4 * 58, len(changes))
+    for k, change in enumerate(changes):
+        rounded = k >= 2 * m + 2
+        numeric = slope(model, extension, spots, change, ROUGH if rounded else FINE)
+        assert float(numeric.abs().max()) > 0, f"column {k} is nothing"
+        tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
+        assert float((ours[:, k] - numeric).abs().max()) < tolerance, f"column {k}"
+    assert torch.allclose(problem.residual, ((counts - expected) / expected.sqrt()).reshape(-1))
+    free = build_problem(model, extension, spots, counts, with_effects=False)
+    parameters = sum(e.declared[p].size for e in extension.effects for p in e.declared)
+    assert free.nuisance.shape[1] == len(changes) - parameters
+    assert torch.equal(free.nuisance, problem.nuisance[:, : free.nuisance.shape[1]])
+
+
+def test_smooth_tilts_lean_many_surfels_together():
+    """More than fifty surfels lean by smooth functions of their place, orthonormal, each with the prior of a tenth of a radian."""
+    model, extension, _, spots = setting("confocal", number=56)
+    fields = tilt_fields(model)
+    f, m = fields.shape[1], len(model)
+    assert f > 10
+    assert torch.allclose(fields.T @ fields / m, torch.eye(f), atol=1e-6)
+    assert torch.equal(fields[:, 0], torch.ones(m))
+    problem = build_problem(model, extension, spots, torch.zeros(4, 58))
+    lean = torch.zeros(2 * m + 2 * f + 4)
+    lean[2 * m : 2 * m + 2 * f] = 1 / TILT_PRIOR**2
+    assert torch.allclose(problem.prior, lean)
+    normal = model.normal().detach()
+    across = torch.nn.functional.normalize(torch.tensor([1.0, 0, 0]) - normal[:, :1] * normal, dim=1)
+    for k in (1, f - 1):
+        numeric = slope(
+            model,
+            extension,
+            spots,
+            lambda mo, ex, h, k=k: mo.raw_normal.copy_(normal + h * fields[:, k, None] * across),
+            FINE,
+        )
+        ours = problem.nuisance[:, 2 * m + k] * problem.expected.reshape(-1).sqrt()
+        assert float((ours - numeric).abs().max()) < 2e-5 * float(numeric.abs().max())
+
+
+def test_batches_of_spots_change_nothing(monkeypatch):
+    model, extension, _, spots = setting("confocal", "gain and pile-up")
+    counts = torch.arange(4 * 58.0).reshape(4, 58)
+    whole = build_problem(model, extension, spots, counts)
+    monkeypatch.setattr("nlos_lit.inference.problem.CHUNK", 1)
+    parts = build_problem(model, extension, spots, counts)
+    assert torch.allclose(parts.nuisance, whole.nuisance, rtol=1e-10)
+    assert torch.equal(parts.residual, whole.residual)
+
+
+@pytest.mark.parametrize("name", [e.name for e in EFFECTS])
+def test_effect_columns_are_the_slope_of_the_render(name):
+    """At values away from the null, beside two effects that were accepted before; amplitudes first, then shapes."""
+    model, extension, scan, spots = setting("exhaustive", "gain and pile-up")
+    extension = Extension([e for e in extension.effects if e.name != name])
+    effect = uneven(effect_of(name, scan)).double()
+    whole = copy_effects(extension, [effect])
+    place = [e.name for e in whole.effects].index(name)
+    ours = effect_columns(model, extension, spots, effect, shapes=True)
+    wanted = [
+        (p.name, k)
+        for p in (*effect.amplitudes, *effect.shapes)
+        for k in range(1 if effect.per_spot else p.size)
+    ]
+    assert ours.shape == (4 * 58, len(wanted))
+    for column, (parameter, k) in enumerate(wanted):
+
+        def change(mo, ex, h, parameter=parameter, k=k):
+            raw = getattr(ex.effects[place], f"raw_{parameter}")
+            raw.add_(h if effect.per_spot else h * unit(len(raw), k))
+
+        rounded = effect.stage == "response"
+        numeric = slope(model, whole, spots, change, ROUGH if rounded else FINE)
+        assert float(numeric.abs().max()) > 0
+        tolerance = (1e-3 if rounded else 5e-5) * float(numeric.abs().max())
+        assert float((ours[:, column] - numeric).abs().max()) < tolerance, parameter
+    amplitudes = effect_columns(model, extension, spots, effect)
+    assert torch.equal(amplitudes, ours[:, : amplitudes.shape[1]])
+    assert amplitudes.shape[1] == sum(1 if effect.per_spot else p.size for p in effect.amplitudes)
+
+
+def test_columns_of_an_accepted_effect_count_it_once():
+    model, extension, _, spots = setting("confocal", "gain and pile-up")
+    vignetting = extension.effects[0]
+    problem = build_problem(model, extension, spots, torch.zeros(4, 58))
+    numeric = slope(model, extension, spots, lambda mo, ex, h: ex.effects[0].raw_strength.add_(h), FINE)
+    ours = effect_columns(model, extension, spots, vignetting)[:, 0]
+    assert float((ours - numeric).abs().max()) < 1e-6 * float(numeric.abs().max())
+    weighted = weighted_columns(problem, vignetting)[:, 0]
+    assert torch.allclose(weighted, ours / problem.expected.reshape(-1).sqrt())
+
+
+def test_effects_act_in_the_order_of_the_registry_whenever_they_were_accepted():
+    _, _, scan, _ = setting("confocal")
+    late = copy_effects(
+        Extension([effect_of("pile_up", scan)]),
+        [effect_of("afterpulsing", scan), effect_of("time_offset", scan)],
+    )
+    assert [e.name for e in late.effects] == ["time_offset", "afterpulsing", "pile_up"]
+    assert [acting_order(e(scan)) for e in EFFECTS] == list(range(len(EFFECTS)))
+    stages = [e.stage for e in EFFECTS]
+    assert sorted(stages, key=["path", "time", "response", "spot", "counting"].index) == stages

@@ -1,0 +1,171 @@
+"""The diagnose command as a user runs it: a subprocess on a reduced scene, a finished run, and what cannot work."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ROOT
+from inference_scenes import capture_of, raster
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from data_modules.readers import write_capture
+from nlos_lit.effects import EFFECTS
+
+SCENE = [
+    "scene.simulate.scan.nx=24",
+    "scene.simulate.scan.ny=24",
+    "scene.volume.depth=[0.4,0.95]",
+    "scene.volume.depth_pitch=0.0192",
+]
+SMALL = [
+    "surfels.rounds=2", "surfels.steps=40", "criticism.spots=96", "criticism.steps=10", "criticism.rivals=1",
+    "criticism.finalists=1", "criticism.far_off=9", "criticism.most=1", "threads=1",
+]  # fmt: skip
+FIGURES = [
+    "residual_time",
+    "residual_depth",
+    "residual_wall",
+    "residual_scan",
+    "residual_rate",
+    "screening",
+    "deviance",
+]
+
+
+def command(script: str, *overrides: str, folder: Path, check: bool = True) -> subprocess.CompletedProcess:
+    done = subprocess.run(
+        [sys.executable, f"{script}.py", *overrides, f"hydra.run.dir={folder}"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=500,
+    )
+    if check:
+        assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
+    return done
+
+
+def times(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("diagnosis") / "one"
+    command("diagnose", *SCENE, *SMALL, folder=folder)
+    return folder
+
+
+def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
+    said = json.loads((finished / "diagnosis" / "diagnosis.json").read_text())
+    assert set(said) == {
+        "effects", "groups", "unexplained", "screened", "base", "extended", "untouched_test", "witness", "profiles", "numerics",
+        "notes", "capture", "toys", "seconds", "seed",
+    }  # fmt: skip
+    assert {s["name"] for s in said["screened"]} == {e.name for e in EFFECTS}
+    for one in said["screened"]:
+        assert 0 <= one["p_value"] <= 1
+        assert one["statistic"] >= 0
+        assert -1e-3 <= one["retained_information"] <= 1 + 1e-3
+    gains = [s["predicted_gain"] for s in said["screened"]]
+    assert gains == sorted(gains, reverse=True)
+    assert said["effects"] == [], "nothing is hidden in the scene"
+    assert set(said["unexplained"]) == {"significant", "axis", "statistic", "p_value"}
+    assert said["base"] == said["extended"]
+    assert said["untouched_test"]["base"]["deviance_noise"] == pytest.approx(
+        said["base"]["deviance_noise"], rel=0.05
+    )
+    assert (
+        said["base"]["deviance_noise"]
+        < said["base"]["deviance_per_bin"]
+        < 1.5 * said["base"]["deviance_noise"]
+    )
+    assert [p["axis"] for p in said["profiles"]] == ["time", "depth", "scan", "rate", "wall"]
+    wall = said["profiles"][-1]
+    assert wall["edges"][0] == pytest.approx(-0.5 + 1 / 48)  # spots stand in the middle of their cells
+    assert wall["edges_y"][-1] == pytest.approx(0.5 - 1 / 48)
+    assert (said["capture"]["kind"], said["capture"]["spots"], said["capture"]["bins"]) == (
+        "confocal",
+        576,
+        256,
+    )
+    assert set(said["numerics"]) == {"another random seed", "finer quadrature of surfels"}
+    assert 0 < abs(said["numerics"]["another random seed"]) < 0.2
+    page = (finished / "diagnosis" / "report.html").read_text()
+    assert "Nothing in the registry is needed" in page
+    assert page.count("data:image/png;base64,") >= len(FIGURES)
+    for name in FIGURES:
+        assert (finished / "diagnosis" / "figures" / f"{name}.png").stat().st_size > 5000
+    assert (finished / "config.yaml").exists()
+
+
+def test_figures_are_in_tensorboard(finished):
+    events = EventAccumulator(str(finished / "tensorboard"))
+    events.Reload()
+    assert {f"diagnosis/{name}" for name in FIGURES} <= set(events.Tags()["images"])
+
+
+def test_a_finished_diagnosis_is_not_overwritten(finished):
+    before = times(finished)
+    done = command("diagnose", *SCENE, *SMALL, folder=finished, check=False)
+    assert done.returncode == 2
+    assert "already holds a diagnosis" in done.stderr
+    assert times(finished) == before
+
+
+def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
+    run = tmp_path / "run"
+    small = [
+        "model.rays=20",
+        "batch_spots=8",
+        "heldout.block=3",
+        "heldout.monitor_spots=16",
+        "export.spots=16",
+        "logger=none",
+    ]
+    command(
+        "train",
+        *SCENE,
+        *small,
+        "scene.name=two plates",
+        "trainer.threads=1",
+        "scene.iterations=1",
+        "seed=3",
+        folder=run,
+    )
+    trained = times(run)
+    command("diagnose", *SMALL, "criticism.numerics=false", f"run={run}", folder=tmp_path / "log")
+    said = json.loads((run / "diagnosis" / "diagnosis.json").read_text())
+    assert said["capture"]["name"] == "two plates"
+    assert said["capture"]["spots"] == 576
+    assert said["numerics"] == {}
+    assert (run / "diagnosis" / "report.html").exists()
+    assert list((run / "tensorboard").glob("events.out.tfevents.*"))
+    assert {path: time for path, time in times(run).items() if path in trained} == trained
+    again = command("diagnose", *SMALL, f"run={run}", folder=tmp_path / "log", check=False)
+    assert again.returncode == 2
+    assert "already holds a diagnosis; move" in again.stderr
+
+
+def test_what_cannot_be_diagnosed_is_one_sentence(tmp_path):
+    render = dataclasses.replace(capture_of(raster(16), counts=np.ones((256, 64))), is_counts=False)
+    write_capture(tmp_path / "render.hdf5", render)
+    bad = {
+        f"run={tmp_path / 'nowhere'}": "is not the folder of a finished run: config.yaml is missing",
+        f"scene=capture scene.path={tmp_path / 'render.hdf5'}": "holds expected values (a render)",
+        "scene.simulate.scan.nx=6 scene.simulate.scan.ny=6": "a diagnosis needs a scan of at least 16 × 16 spots",
+    }
+    for overrides, words in bad.items():
+        done = command("diagnose", *SMALL, *overrides.split(), folder=tmp_path / "bad", check=False)
+        assert done.returncode == 2, done.stderr[-2000:]
+        assert "Traceback" not in done.stderr
+        sentence = done.stderr.strip().splitlines()[-1]
+        assert sentence.startswith("error: ")
+        assert words in sentence
+        assert not (tmp_path / "bad" / "diagnosis").exists()

@@ -1,0 +1,121 @@
+"""From a scene's config to its capture."""
+
+from __future__ import annotations
+
+import hashlib
+import http.server
+import threading
+
+import numpy as np
+import pytest
+from conftest import ROOT, real_file
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from data_modules.load import find_file, load_scene
+from data_modules.readers import write_capture
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.surface_truth import SurfaceTruth
+from nlos_lit.training.outcome import albedo_regions
+
+
+def scene(name: str = "default", *overrides: str) -> dict:
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = compose("train", overrides=[f"scene={name}", *overrides])
+    return OmegaConf.to_container(config.scene, resolve=True)
+
+
+SMALL = ("scene.simulate.scan.nx=6", "scene.simulate.scan.ny=4")
+
+
+def test_the_embedded_scene_is_simulated_with_its_truth(tmp_path):
+    capture, truth = load_scene(scene("default", *SMALL), tmp_path, seed=3)
+    assert capture.scan_shape == (6, 4)
+    again, _ = load_scene(scene("default", *SMALL), tmp_path, seed=3)
+    other, _ = load_scene(scene("default", *SMALL), tmp_path, seed=4)
+    assert np.array_equal(capture.counts, again.counts)
+    assert not np.array_equal(capture.counts, other.counts)
+    assert np.nanmin(truth.depth) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_given_path_replaces_the_scenes_own_data_and_is_summed_and_gated(tmp_path):
+    capture, _ = load_scene(scene("default", *SMALL), tmp_path, seed=0)
+    write_capture(tmp_path / "x.hdf5", capture)
+    changed = scene(
+        "letters",
+        f"scene.path={tmp_path}/x.hdf5",
+        "scene.sum_bins=2",
+        "scene.gate=[20,100]",
+        "scene.sum_spots=2",
+    )
+    read, truth = load_scene(changed, tmp_path, seed=0)
+    assert truth is None
+    assert read.scan_shape == (3, 2)
+    assert read.gate == (20, 100)
+    assert read.counts.sum() == capture.counts.sum()
+    assert read.bin_length == pytest.approx(2 * capture.bin_length)
+
+
+def test_a_file_in_the_data_folder_is_found(tmp_path):
+    (tmp_path / "data_s_u.mat").write_bytes(b"x")
+    assert find_file(scene("su"), tmp_path) == tmp_path / "data_s_u.mat"
+    with pytest.raises(
+        UserError, match=r"needs data_diffuse_s.mat.*comes from the supplement of O'Toole.*scene.path=FILE"
+    ):
+        find_file(scene("diffuse_s"), tmp_path)
+
+
+def test_a_known_address_is_downloaded_and_its_checksum_checked(tmp_path):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "capture.bin").write_bytes(b"photons")
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def __init__(self, *args, **kwargs):
+            super().__init__(*args, directory=str(tmp_path / "site"), **kwargs)
+
+        def log_message(self, *_):
+            pass
+
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/capture.bin"
+        known = scene("su") | {"source": {"file": "got.bin", "origin": "here", "url": url, "sha256": None}}
+        known["source"]["sha256"] = hashlib.sha256(b"photons").hexdigest()
+        assert find_file(known, tmp_path / "data").read_bytes() == b"photons"
+        known["source"] |= {"file": "other.bin", "sha256": hashlib.sha256(b"electrons").hexdigest()}
+        with pytest.raises(UserError, match=r"could not download .* put it at .*other.bin"):
+            find_file(known, tmp_path / "data")
+        assert not (tmp_path / "data" / "other.bin").exists()
+        server.shutdown()
+
+
+def test_albedo_regions_are_the_bright_and_the_dark_half():
+    albedo = np.array([[1.0, 0.9, 0.3], [np.nan, 0.35, 0.0]])
+    truth = SurfaceTruth(np.arange(2.0), np.arange(3.0), np.ones((2, 3)), None, albedo)
+    bright, dark = albedo_regions(truth)
+    assert bright.tolist() == [[True, True, False], [False, False, False]]
+    assert dark.tolist() == [[False, False, True], [False, True, False]]
+    plain = SurfaceTruth(np.arange(2.0), np.arange(3.0), np.ones((2, 3)), None, np.full((2, 3), 0.5))
+    assert albedo_regions(plain) is None
+
+
+def test_su_as_its_config_says():
+    capture, _ = load_scene(scene("su", f"scene.path={real_file('measured/data_s_u.mat')}"), "data", seed=0)
+    assert (capture.n_spots, capture.n_bins, capture.gate) == (4096, 512, (200, 512))
+    assert capture.bin_width_ps == pytest.approx(16)
+
+
+def test_figure_4_as_its_config_says():
+    capture, _ = load_scene(scene("figure_4", f"scene.path={real_file('measured/figure_4')}"), "data", seed=0)
+    assert capture.kind == "single_sensor"
+    assert capture.bin_width_ps == pytest.approx(16)
+
+
+def test_a_render_with_its_truth():
+    render, truth_file = real_file("rendered/z_confocal_64_d3.hdf5"), real_file("rendered/z_gt.h5")
+    capture, truth = load_scene(
+        scene("capture", f"scene.path={render}", f"scene.truth={truth_file}"), "data", seed=0
+    )
+    assert not capture.is_counts
+    assert np.isfinite(truth.depth).any()
+    assert np.nanmax(truth.depth) < 3

@@ -1,0 +1,340 @@
+"""The report: what it says, that every number is in it, that it needs nothing but itself; figures show what they should."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+from report_cases import CASES, NAMES, NAN, TAIL, TILT, diagnosis, two_found
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import build_effects
+from nlos_lit.inference.result import Accepted, Estimate, Gain, Scores, Unexplained
+from nlos_lit.report import diagnosis_figures as plots
+from nlos_lit.report.page import report_html, write_report
+from nlos_lit.report.quantities import (
+    UNIT_OF_KIND,
+    amount,
+    headline,
+    number,
+    plus_minus,
+    probability,
+    quantity,
+)
+from nlos_lit.report.verdict import misfit, sureness, verdict
+from nlos_lit.report.words import WORDS, describe
+
+
+class Page(HTMLParser):
+    """Text, attributes that load or lead somewhere, and whether tags close in order."""
+
+    VOID = frozenset({"meta", "img", "br"})
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.open, self.text, self.sources, self.tags, self.label = [], [], [], set(), []
+        self.feed(page)
+        assert self.open == []
+        self.words = re.sub(r"\s+", " ", " ".join(self.text))
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.add(tag)
+        self.sources += [
+            value for name, value in attributes if name in ("src", "href", "srcset", "data", "action")
+        ]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.text.append(data)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> dict:
+    folders = {name: tmp_path_factory.mktemp(name) for name in CASES}
+    return {name: write_report(found, folders[name]) for name, found in CASES.items()}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_page_needs_nothing_but_itself(written, case):
+    page = written[case].read_text(encoding="utf-8")
+    assert written[case].name == "report.html"
+    seen = Page(page)
+    assert seen.tags.isdisjoint({"script", "link", "iframe", "object", "base"})
+    assert all(source.startswith("data:image/png;base64,") for source in seen.sources)
+    assert not re.search(r"https?:|url\(|@import", page)
+    files = sorted((written[case].parent / "figures").glob("*.png"))
+    inlined = [base64.b64decode(source.split(",")[1]) for source in seen.sources]
+    assert sorted(inlined) == sorted(file.read_bytes() for file in files)
+    assert len(files) == len(plots.diagnosis_figures(CASES[case]))
+    assert sorted(p.name for p in written[case].parent.iterdir()) == [
+        "diagnosis.json",
+        "figures",
+        "report.html",
+    ]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_json_is_the_diagnosis(written, case):
+    read = json.loads((written[case].parent / "diagnosis.json").read_text(encoding="utf-8"))
+    assert read == CASES[case].to_dict()
+    assert set(read) == {
+        *(
+            "effects",
+            "groups",
+            "unexplained",
+            "screened",
+            "base",
+            "extended",
+            "untouched_test",
+            "seconds",
+            "seed",
+        ),
+        *("witness", "profiles", "numerics", "notes", "capture", "toys"),
+    }
+    assert set(read["unexplained"]) == {"significant", "axis", "statistic", "p_value"}
+    for effect in read["effects"]:
+        assert set(effect) == {
+            "name",
+            "parameters",
+            "statistic",
+            "p_value",
+            "heldout_gain",
+            "confusable_with",
+            "split_by",
+        }
+        assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
+        assert set(effect["heldout_gain"]) == {
+            "deviance_per_bin_before",
+            "deviance_per_bin_after",
+            "nats_per_photon",
+            "ci95",
+        }
+        assert len(effect["heldout_gain"]["ci95"]) == 2
+    for one in read["screened"]:
+        assert {"name", "statistic", "p_value", "retained_information", "detectable"} <= set(one)
+
+
+def test_json_of_values_that_are_not_numbers_is_null(written):
+    read = json.loads((written["nan"].parent / "diagnosis.json").read_text(encoding="utf-8"))
+    assert read["effects"][0]["parameters"]["fraction"] == {"value": 0.2, "stderr": None, "unit": "1"}
+    assert read["screened"][0]["detectable"] == {"detections": None}
+    assert read["profiles"][0]["before"] == [None] * 3
+
+
+def test_verdicts():
+    tail = "Your simulation misses a slow detector tail: 21 ± 2 % of the photons, τ = 0.39 ns"
+    # excess on untouched spots: 1.30 - 0.94 = 0.36 before, 1.03 - 0.93 = 0.10 after, so 72 % explained
+    assert (
+        verdict(two_found(effects=[TAIL], groups=[]))
+        == f"{tail}; modelling it explains 72 % of the excess misfit."
+    )
+    # without untouched spots: (1.2417 - 0.9402) = 0.3015, (1.0351 - 0.9251) = 0.11: 64 %
+    assert "64 % of" in verdict(two_found(effects=[TAIL], groups=[], untouched_test={}))
+    assert verdict(CASES["nothing"]) == "Nothing in the registry is needed: the fit is at the noise."
+    assert (
+        verdict(CASES["unexplained"])
+        == "Something is wrong along the time axis that no known effect explains."
+    )
+    both = verdict(CASES["two"])
+    assert both.startswith("Your simulation misses 2 things: (1) a slow detector tail")
+    assert "41.3 ± 0.9 mrad along x" in both
+    assert verdict(CASES["two"], listed=False).startswith(
+        "Your simulation misses 2 things; modelling them explains"
+    )
+    page = report_html(CASES["two"], {})
+    head = page[page.index("<h1") : page.index("</header>")]
+    assert "mrad" not in head[: head.index("</h1>")]
+    assert head.count("<li>") == 2
+    assert "41.3 ± 0.9 mrad along x" in head
+    assert "<li>" not in report_html(two_found(effects=[TAIL], groups=[]), {}).split("</header>")[0]
+    assert (
+        "(or a time zero that drifts during the scan: this capture cannot tell which); modelling them" in both
+    )
+    group = verdict(diagnosis(groups=[["pile_up", "time_offset"]]))
+    assert group.startswith(
+        "Your simulation misses one of these, and this capture cannot tell which: pile-up"
+    )
+    left = verdict(two_found(unexplained=Unexplained(True, "wall", 80.0, 1e-4)))
+    assert left.endswith("Something is still wrong across the wall that no known effect explains.")
+    # 0.0740 / 0.7113 above noise, not significant
+    above = diagnosis(base=Scores(0.7853, 0.7113, 0.02, 0.015), untouched_test={})
+    assert "at the noise" not in verdict(above)
+    assert "10 % above counting noise" in verdict(above)
+
+
+def test_misfit_parts_add_up_and_keep_to_their_bounds():
+    m = misfit(CASES["two"])
+    assert (m.noise, m.explained, m.unexplained) == pytest.approx((0.94, 0.26, 0.10))
+    assert m.untouched
+    worse = misfit(two_found(untouched_test={"base": Scores(1.2, 1, 0, 0), "extended": Scores(1.3, 1, 0, 0)}))
+    assert (worse.explained, worse.unexplained, worse.share) == pytest.approx((0.0, 0.2, -0.5))
+    below = misfit(two_found(untouched_test={"base": Scores(1.2, 1, 0, 0), "extended": Scores(0.9, 1, 0, 0)}))
+    assert (below.explained, below.unexplained, below.share) == pytest.approx((0.2, 0.0, 1.5))
+    assert misfit(diagnosis(base=Scores(0.7, 0.71, 0, 0), untouched_test={})).share is None
+
+
+def test_sureness_is_not_more_than_there_is():
+    assert "any one of these effects is 3.0 × 10⁻¹⁴. The gain holds" in sureness(CASES["two"])
+    assert "200 simulated captures" in sureness(CASES["two"])
+    assert "leaves what stays unexplained is 1.0 × 10⁻⁹." in sureness(CASES["unexplained"])
+    assert "no simulated captures were run" in sureness(CASES["unexplained"])
+    assert "Effects tested: 23, of which 1 barely identifiable in this capture, 2 not at all" in sureness(
+        CASES["nothing"]
+    )
+    doubtful = dataclasses.replace(TILT, heldout_gain=Gain(1.2, 1.19, 0.001, (-0.001, 0.003)))
+    assert "The gain of 1 of 2 effects holds" in sureness(two_found(effects=[TAIL, doubtful]))
+    assert "chance that noise alone would look" not in sureness(CASES["nan"])
+
+
+def test_every_number_is_on_the_page(written):
+    text = Page(written["two"].read_text(encoding="utf-8")).words
+    for expected in (
+        *(
+            "21 ± 2 %",
+            "0.39 ± 0.02 ns",
+            "117 ± 6 mm of path",
+            "24.4 ± 1.3 bins",
+            "9123",
+            "3.0 × 10⁻¹⁴",
+            "< 10⁻³⁰⁰",
+        ),
+        *(
+            "0.0123 nats",
+            "0.0111 … 0.0137",
+            "1.242 → 1.190",
+            "afterpulsing",
+            "split by: a capture with other background light",
+        ),
+        *("41.3 ± 0.9 mrad", "2.37 ± 0.05 °", "−2.1 ± 1.1 mrad", "a second scan in another order"),
+        *("statistic 31.7, p = 0.42", "1.242 0.9402 0.08380 0.04320", "1.030 0.9300 0.05400 0.04310"),
+        *(
+            "splat width 0.00117",
+            "1,234,567",
+            "0.803",
+            "0.260 ns … 0.370 ns",
+            "4096",
+            "1503.25",
+            "seed 17",
+            "toys 200",
+            "time taken (s) 412.7",
+        ),
+        *("[200, 512]", "raster", "letters <S&U>", "The splat's <width> was 0.62 bins."),
+    ):
+        assert expected in text, expected
+    for one in CASES["two"].screened:
+        assert number(one.statistic) in text
+        assert number(one.predicted_gain) in text
+        assert describe(one.name).phrase in text
+
+
+def test_values_that_are_not_numbers_are_dashes(written):
+    text = Page(written["nan"].read_text(encoding="utf-8")).words
+    assert not re.search(r"\bnan\b|\binf\b|None", text)
+    assert "20.0 ± ? %" in text
+
+
+def test_markup_in_names_is_escaped(written):
+    page = written["nothing"].read_text(encoding="utf-8")
+    assert "letters &lt;S&amp;U&gt;" in page
+    assert "<S&U>" not in page
+    assert "<width>" not in page
+
+
+def test_what_could_not_have_been_seen_is_said():
+    text = Page(report_html(CASES["nothing"], {})).words
+    limits = text[text.index("What could not have been seen") :]
+    assert "ghost_pulse at no possible strength barely identifiable" in limits
+    assert "pile_up at no possible strength" in limits  # 1.5 detections a cycle
+    assert "time_offset strength 0.167 ns barely identifiable" in limits  # 50 mm of path
+    assert "irf_tail fraction 0.430 %" in limits
+    assert "time_drift coefficients 7.00 ps" in limits  # 2.1 mm of path
+    order = [limits.index(name) for name in ("ghost_pulse", "time_offset", "irf_tail")]
+    assert order == sorted(order)
+
+
+@pytest.mark.parametrize(
+    ("value", "stderr", "text"),
+    [(0.2113, 0.021, "0.21 ± 0.02"), (5.4321, 0.0123, "5.432 ± 0.012"), (1234.5, 56.0, "1230 ± 60"), (-0.001, 0.2, "0.0 ± 0.2"),
+     (3.0, 0.0, "3.00 ± ?"), (2e-9, 3e-10, "2.00 × 10⁻⁹ ± 3 × 10⁻¹⁰")],
+)  # fmt: skip
+def test_values_are_rounded_where_their_error_is(value, stderr, text):
+    assert plus_minus(value, stderr) == text
+
+
+def test_units_people_think_in():
+    # 0.01 m of path is 33.36 ps; light takes 1 ns for 299.8 mm
+    assert quantity("time_offset", "offset", Estimate(0.01, 0.001, "m"), 0.005) == [
+        "33 ± 3 ps",
+        "10.0 ± 1.0 mm of path",
+        "2.0 ± 0.2 bins",
+    ]
+    assert quantity("time_offset", "offset", Estimate(0.01, 0.001, "m"), None) == [
+        "33 ± 3 ps",
+        "10.0 ± 1.0 mm of path",
+    ]
+    assert quantity("occlusion", "z", Estimate(0.25, 0.03, "m"), 0.005) == ["250 ± 30 mm"]
+    assert quantity("pile_up", "detections", Estimate(0.8, 0.03, "1"), None) == ["0.80 ± 0.03"]
+    assert quantity("direct_leak", "amplitude", Estimate(0.8, 0.03, "counts/bin"), None) == [
+        "0.80 ± 0.03 counts/bin"
+    ]
+    assert quantity("irf_tail", "fraction", Estimate(0.8, 0.03, "counts"), None) == ["0.80 ± 0.03 counts"]
+    assert quantity("tcspc_nonlinearity", "period", Estimate(16.0, 0.2, "bins"), 0.002998)[1] == "160 ± 2 ps"
+    assert amount("wall_tilt", "tilt_x", 0.04, None) == "40.0 mrad"
+    assert (number(0), number(None), number(-1.5e-7, 2), number(math.inf)) == ("0", "–", "−1.5 × 10⁻⁷", "–")
+    assert (probability(0.0), probability(0.031), probability(NAN)) == ("< 10⁻³⁰⁰", "0.031", "–")
+
+
+def test_every_effect_has_words_and_a_headline_that_works():
+    assert set(WORDS) == set(NAMES)
+    for name, words in WORDS.items():
+        assert words.cause.endswith(".")
+        assert words.remedy.endswith(".")
+        fields = re.findall(r"{(\w+)}", words.headline)
+        assert fields
+        text = headline(name, {field: Estimate(0.7, 0.1, "1") for field in fields})
+        assert len(re.findall(r"\b(0\.70?|70)\b", text)) == len(fields), text
+
+
+def test_words_speak_of_the_registry_s_parameters_in_their_units():
+    x, y = np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.4, 0.4, 5), indexing="ij")
+    wall, up = np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1), np.tile([0.0, 0.0, 1.0], (25, 1))
+    counts = np.random.default_rng(2).poisson(3.0, (25, 120)).astype(np.uint16)
+    scan = Scan.of(Capture(counts, wall, wall, up, up, bin_length=0.02, gate=(30, 110)))
+    for effect in build_effects(NAMES, scan):
+        words, declared = describe(effect.name), effect.declared
+        with torch.no_grad():
+            units = {name: q.unit for name, q in effect.quantities().items()} | {
+                p.name: p.unit for p in declared.values()
+            }
+        assert {f"{name} {UNIT_OF_KIND[words.kind_of(name)]}" for name in units} == {
+            f"{n} {u}" for n, u in units.items()
+        }, effect.name
+        for p in declared.values():
+            assert words.null_of(p.name) == p.null, (effect.name, p.name)
+        assert set(re.findall(r"{(\w+)}", words.headline)) - {"share"} <= set(units), effect.name
+
+
+def test_an_effect_without_words_is_called_by_its_name():
+    new = Accepted(
+        "dust_cloud",
+        {"optical_depth": Estimate(0.4, 0.05, "1")},
+        99.0,
+        1e-6,
+        Gain(1.2, 1.1, 0.01, (0.005, 0.02)),
+    )
+    text = verdict(two_found(effects=[new], groups=[]))
+    assert text.startswith("Your simulation misses dust cloud: optical depth 0.40 ± 0.05; modelling it")
+    assert headline("irf_tail", {"fraction": Estimate(0.2, 0.02, "1")}) == "fraction 20 ± 2 %"

@@ -1,0 +1,284 @@
+"""Refinement of a small scene: at the noise, better than its image, repeatable, blind to held-out counts, silent on noise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from data_modules.simulate import ScanPlan, SensorModel, join, simulate_capture
+from data_modules.simulate.scenes import plate
+from data_modules.spots import heldout_mask
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
+from nlos_lit.effects import build_effects
+from nlos_lit.effects.extension import Extension
+from nlos_lit.model.build import PipelineSettings, build_pipeline
+from nlos_lit.surfels.effect_start import choose_shapes
+from nlos_lit.surfels.growth import Candidates, best_apart, neighbour_candidates, occupied, prune_and_grow
+from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.refine import RefineSettings, refine, score_spots
+
+QUICK = RefineSettings(
+    rounds=3, steps=60, more=0, batch=24, test_spots=200, floor=0.15, per_cell=2, quadrature=2
+)
+BIN = 0.0096
+
+
+def scene() -> tuple[Capture, np.ndarray]:
+    """A tilted plate and, behind its edge, a darker one; 20 × 20 spots, 1500 counts each.
+
+    Cells of 5 cm are coarse: half of them hold an edge, so the noise is missed by some per cent.
+    """
+    front = plate((0.12, 0.08, 0.5), 0.3, 0.25, turn_y=0.25, albedo=0.9)
+    back = plate((-0.15, -0.12, 0.75), 0.35, 0.3, albedo=0.5)
+    scan = ScanPlan(kind="confocal", nx=20, ny=20, width=1.0, n_bins=190, bin_length=BIN, t_start=0.6)
+    sensor = SensorModel(sigma=1.0 * BIN, kappa=0.6 / BIN, background=0.15, mean_counts=1500)
+    capture, _ = simulate_capture(join(front, back), scan, sensor, seed=2)
+    return capture, heldout_mask(capture, 3, 4)
+
+
+def image(capture: Capture) -> tuple[torch.Tensor, VolumeGrid]:
+    grid = volume_grid(capture, depth=(0.35, 0.95))
+    phasor = build_pipeline(capture, grid, PipelineSettings(0.1)).phasor
+    phasor.prepare(capture, phasor.plan(capture, 2**30))
+    with torch.no_grad():
+        return phasor(), grid
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    """Tensors here are small: a second thread costs more than it brings, much more on a busy machine."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    capture, held = scene()
+    intensity, grid = image(capture)
+    train = np.flatnonzero(~held)
+    return (
+        capture,
+        held,
+        intensity,
+        grid,
+        refine(capture, intensity, grid, QUICK, train, seed=0, heldout_spots=np.flatnonzero(held)),
+    )
+
+
+def test_reaches_the_noise_on_held_out_spots(fitted):
+    result = fitted[-1]
+    assert result.heldout.deviance_per_bin < 1.08 * result.heldout.deviance_noise
+    assert result.heldout.nmse < 1.3 * result.heldout.nmse_noise_floor
+    assert result.history[-1]["surfels"] == len(result.model)
+
+
+def test_recovers_response_and_background(fitted):
+    parameters = {name: value for name, (value, _) in fitted[-1].parameters.items()}
+    assert parameters["sigma_ls"] == pytest.approx(BIN, rel=0.1)
+    assert parameters["kappa_s"] == pytest.approx(0.6 / BIN, rel=0.25)
+    assert parameters["background"] == pytest.approx(0.15, rel=0.05)
+
+
+def test_places_and_normals_lie_on_the_plates(fitted):
+    points = fitted[-1].points()
+    strong = points.albedo > 0.3
+    near = strong & (points.positions[:, 2] > 0.65)
+    assert np.median(np.abs(points.positions[near, 2] - 0.75)) < BIN / 8
+    tilted = strong & (points.positions[:, 2] < 0.6)
+    # The plate turned by 0.25 about y: z = 0.5 - tan(0.25) (x - 0.12).
+    plane = 0.5 - np.tan(0.25) * (points.positions[tilted, 0] - 0.12)
+    assert np.median(np.abs(points.positions[tilted, 2] - plane)) < BIN / 8
+    cosine = points.normals[tilted] @ np.array([-np.sin(0.25), 0, -np.cos(0.25)])
+    assert np.degrees(np.arccos(np.clip(np.median(cosine), -1, 1))) < 6
+    ratio = np.median(points.albedo[near]) / np.median(points.albedo[tilted])
+    assert ratio == pytest.approx(0.5 / 0.9, rel=0.15)
+
+
+def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
+    capture, held, intensity, grid, _ = fitted
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=2, steps=8)
+    counts = capture.counts.copy()
+    counts[held] = 7 * counts[held][:, ::-1] + 1
+    changed = dataclasses.replace(capture, counts=counts)
+    scored = np.flatnonzero(held)
+    first, again = (
+        refine(capture, intensity, grid, short, train, seed=4, heldout_spots=scored) for _ in range(2)
+    )
+    blind = refine(changed, intensity, grid, short, train, seed=4, heldout_spots=scored)
+    other = refine(capture, intensity, grid, short, train, seed=5)
+    for name, value in first.model.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, again.model.state_dict()[name])
+            assert torch.equal(value, blind.model.state_dict()[name])
+    assert blind.heldout.deviance_per_bin > 2 * first.heldout.deviance_per_bin
+    assert first.parameters != other.parameters
+
+
+def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
+    capture, held, intensity, grid, _ = fitted
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=1, steps=20)
+    seen, deviances, rounds = [], [], []
+    for more in (0, 1, 6):
+        settings = dataclasses.replace(short, more=more)
+        progress = (lambda *count: seen.append(count)) if more == 1 else None
+        result = refine(capture, intensity, grid, settings, train, progress=progress)
+        deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
+        rounds.append(len(result.history))
+    assert rounds[:2] == [1, 2]
+    assert 3 <= rounds[2] <= 7
+    assert deviances[0] > deviances[1] > deviances[2]
+    assert seen == [(k, 40) for k in range(1, 41)] + [(k, 80) for k in range(41, 81)]
+    own = result.fit.copy(Extension([]), 0)
+    own.counts = own.model.expected(own.train)
+    assert own.converge() == []
+
+
+def test_only_the_given_spots_are_scored(fitted):
+    capture, held, intensity, grid, _ = fitted
+    short, train = dataclasses.replace(QUICK, rounds=1, steps=2), np.flatnonzero(~held)
+    assert refine(capture, intensity, grid, short, train).heldout is None
+    some = np.flatnonzero(held)[5:25]
+    result = refine(capture, intensity, grid, short, train, heldout_spots=some)
+    counts, expected = (
+        capture.gated_counts()[some].astype(float),
+        result.expected(torch.from_numpy(some)).double().numpy(),
+    )
+    assert result.heldout.nmse == pytest.approx(
+        ((counts - expected) ** 2).sum() / (counts**2).sum(), rel=1e-4
+    )
+
+
+def rippled(capture: Capture, period: float, height: float) -> Capture:
+    """Bins that ripple: counts drawn anew from scaled ones keep Poisson statistics where they get thinner."""
+    ripple = (1 + height * np.sin(2 * np.pi * np.arange(capture.n_bins) / period)) / (1 + height)
+    return dataclasses.replace(
+        capture, counts=np.random.default_rng(3).binomial(capture.counts, ripple).astype(np.uint16)
+    )
+
+
+def test_effects_are_fitted_along_and_their_shapes_found(fitted):
+    """The grid's middle, a period of 4 bins, is nowhere near the true one."""
+    capture, held, intensity, grid, _ = fitted
+    rough, train = rippled(capture, 11.3, 0.2), np.flatnonzero(~held)
+    settings = dataclasses.replace(QUICK, rounds=2)
+    seen, scores = [], {}
+    for scan_shapes in (False, True):
+        extension = Extension(build_effects(["tcspc_nonlinearity"], Scan.of(rough)))
+        result = refine(
+            rough, intensity, grid, settings, train, extension=extension, heldout_spots=np.flatnonzero(held),
+            scan_shapes=scan_shapes, progress=lambda done, total: seen.append((done, total)),
+        )  # fmt: skip
+        scores[scan_shapes] = result.heldout.deviance_per_bin / result.heldout.deviance_noise
+        ripple = {name: q.value.item() for name, q in result.extension.effects[0].quantities().items()}
+        assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
+    assert ripple["amplitude"] == pytest.approx(0.2, abs=0.03)
+    assert scores[True] < scores[False] - 0.02
+    assert seen[180:] == [(k, 240) for k in range(1, 241)]
+
+
+def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
+    """Everything but the effects is true here: the fitted model, its counts drawn with a tail."""
+    capture, _, _, _, result = fitted
+    model, spots = result.model, torch.arange(capture.n_spots)
+    scan = Scan.of(capture)
+    (tail,) = build_effects(["irf_tail"], scan)
+    tail.set("fraction", 0.25)
+    tail.set("decay", 25 * BIN)
+    expected = model.expected(spots, Extension([tail]))
+    counts = torch.poisson(expected, generator=torch.Generator().manual_seed(0))
+    found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
+    choose_shapes(model, found, spots, counts)
+    fitted_tail, wall, leak = found.effects
+    assert fitted_tail.value("decay").item() == pytest.approx(25 * BIN)
+    assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
+    assert leak.value("amplitude").item() < 0.02
+    assert wall.value("gain_map").abs().max() == 0
+
+
+def test_progress_counts_every_step(fitted):
+    capture, held, intensity, grid, _ = fitted
+    seen = []
+    settings = dataclasses.replace(QUICK, rounds=2, steps=3)
+    refine(
+        capture,
+        intensity,
+        grid,
+        settings,
+        np.flatnonzero(~held),
+        progress=lambda done, total: seen.append((done, total)),
+    )
+    assert seen == [(k, 9) for k in range(1, 10)]
+
+
+@pytest.mark.parametrize("ambient", [0.3, 40.0])
+def test_noise_alone_seeds_nothing(fitted, ambient):
+    capture, held, _, _, _ = fitted
+    noise = np.random.default_rng(1).poisson(ambient, capture.counts.shape).astype(np.uint16)
+    empty = dataclasses.replace(capture, counts=noise)
+    intensity, grid = image(empty)
+    with pytest.raises(UserError, match="significant"):
+        refine(empty, intensity, grid, QUICK, np.flatnonzero(~held))
+
+
+def test_high_ambient_light_seeds_few_and_finds_the_scene(fitted):
+    capture, held, _, _, clean = fitted
+    bright = capture.counts + np.random.default_rng(1).poisson(12.0, capture.counts.shape).astype(np.uint16)
+    capture = dataclasses.replace(capture, counts=bright)
+    intensity, grid = image(capture)
+    result = refine(
+        capture, intensity, grid, QUICK, np.flatnonzero(~held), heldout_spots=np.flatnonzero(held)
+    )
+    assert len(result.model) < 2 * len(clean.model)
+    assert result.parameters["background"][0] == pytest.approx(12.15, rel=0.02)
+    assert result.heldout.deviance_per_bin < 1.05 * result.heldout.deviance_noise
+
+
+def test_surfels_in_empty_space_die_and_missing_ones_grow(fitted):
+    capture, held, _, grid, result = fitted
+    model = SurfelModel.from_state(capture, result.model.state_dict())
+    centre, normal, albedo = (t.detach() for t in (model.centre(), model.normal(), model.albedo()))
+    gone = (centre[:, :2] - torch.tensor([0.12, 0.08])).norm(dim=1) < 0.06
+    assert gone.sum() >= 3
+    ghosts = torch.tensor([[0.4, -0.4, 0.4], [-0.4, 0.4, 0.4], [0.42, 0.42, 0.9]])
+    model.place(
+        torch.cat([centre[~gone], ghosts]),
+        torch.cat([normal[~gone], torch.tensor([[0.0, 0.0, -1.0]]).expand(3, 3)]),
+        torch.cat([albedo[~gone], torch.full((3,), 1e-5)]),
+    )
+    train = torch.from_numpy(np.flatnonzero(~held))
+    counts = torch.from_numpy(capture.gated_counts())[train]
+    nothing = Candidates(torch.zeros(0, 3), torch.zeros(0, 3))
+    prune_and_grow(model, capture, grid, nothing, counts, train, torch.arange(200), prune=1.5, grow=3.5)
+    now = model.centre().detach()
+    assert torch.cdist(ghosts, now).min() > 0.02
+    assert ((now[:, :2] - torch.tensor([0.12, 0.08])).norm(dim=1) < 0.06).sum() >= 2
+
+
+def test_candidates_keep_apart():
+    centre = torch.tensor([[0.0, 0.0, 1.0], [0.01, 0.0, 1.0], [0.1, 0.0, 1.0]])
+    assert best_apart(centre, torch.tensor([1.0, 3.0, 2.0]), 0.05).tolist() == [1, 2]
+    assert len(best_apart(centre[:0], torch.zeros(0), 0.05)) == 0
+    assert occupied(centre, centre[:1], 0.05).tolist() == [True, True, False]
+    around = neighbour_candidates(
+        torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.6, 0.0, -0.8]]), torch.tensor([0.1, 0.2])
+    )
+    # Slope 0.75 along x: a step of 0.1 in x rises by 0.075.
+    assert torch.allclose(around.centre[-1], torch.tensor([0.1, 0.2, 1.075]), atol=1e-6)
+
+
+def test_impossible_input_is_refused(fitted):
+    capture, held, intensity, grid, _ = fitted
+    with pytest.raises(UserError, match="its grid"):
+        refine(capture, intensity[1:], grid, QUICK, np.flatnonzero(~held))
+    with pytest.raises(UserError, match="at least 1"):
+        RefineSettings(rounds=0)
+    with pytest.raises(UserError, match="floor"):
+        RefineSettings(floor=1.5)

@@ -1,0 +1,255 @@
+"""Surfels: hand-computed transients, energy, gradients, visibility."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from data_modules.simulate import ScanPlan, simulate_transients
+from data_modules.simulate.scenes import plate
+from nlos_lit.capture import Capture
+from nlos_lit.effects.hooks import NOTHING, Hooks
+from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
+from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
+from nlos_lit.model.parameters import BoundedParameter
+from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
+
+CELL = 0.05
+FACING = [0.0, 0.0, -1.0]
+
+
+def wall(laser, sensor=None, n_bins=300, bin_length=0.01, gate=None) -> Capture:
+    laser = np.asarray(laser, dtype=float)
+    up = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
+    sensor = laser if sensor is None else np.asarray(sensor, dtype=float)
+    counts = np.ones((len(laser), n_bins), dtype=np.uint16)
+    return Capture(counts, laser, sensor, up, up, bin_length=bin_length, gate=gate)
+
+
+def build(
+    capture, centre, normal=None, albedo=None, quadrature=1, sigma=1.0, kappa=0.6, background=0.2, cell=CELL
+) -> SurfelModel:
+    length, m = capture.bin_length, len(centre)
+    sensor = spline_sensor(
+        capture,
+        {
+            "sigma_ls": BoundedParameter(sigma * length, 0.59 * length, 10 * length, "m"),
+            "kappa_s": BoundedParameter(kappa / length, 0.02 / length, 50 / length, "1/m"),
+            "intensity": BoundedParameter(100.0, 1.0, 1e4, "counts m2"),
+            "background": BoundedParameter(background, 1e-3, 10.0, "counts/bin"),
+        },
+    )
+    normal = torch.tensor([FACING] * m if normal is None else normal)
+    albedo = torch.ones(m) if albedo is None else torch.tensor(albedo)
+    lateral = Lateral((-1.0, -1.0), (cell, cell), (41, 41))
+    return SurfelModel(
+        capture,
+        centre=torch.tensor(centre),
+        normal=normal,
+        albedo=albedo,
+        lateral=lateral,
+        laser_sensor=sensor,
+        quadrature=quadrature,
+    )
+
+
+def random_model(quadrature=2) -> tuple[SurfelModel, torch.Tensor]:
+    rng = np.random.default_rng(3)
+    capture = wall(
+        rng.uniform(-0.4, 0.4, (5, 3)) * [1, 1, 0], rng.uniform(-0.4, 0.4, (5, 3)) * [1, 1, 0], gate=(40, 300)
+    )
+    centre = (rng.uniform(-0.3, 0.3, (7, 3)) + np.array([0, 0, 0.8])).tolist()
+    normal = (rng.normal(0, 0.3, (7, 3)) + FACING).tolist()
+    return build(capture, centre, normal, rng.uniform(0.2, 1.5, 7).tolist(), quadrature), torch.tensor(
+        [4, 0, 2]
+    )
+
+
+def test_one_surfel_by_hand():
+    # Laser (0.3, 0, 0), sensor (0, 0.4, 0), surfel at (0, 0, 0.4): d1 = 0.5, d2 = √0.32, all cosines are 0.4/d.
+    model = build(wall([[0.3, 0.0, 0.0]], [[0.0, 0.4, 0.0]]), [[0.0, 0.0, 0.4]])
+    paths = model.paths(torch.tensor([0]))
+    d1, d2 = 0.5, math.sqrt(0.32)
+    expected = CELL**2 * (0.4 / d1) ** 2 * (0.4 / d2) ** 2 / (d1**2 * d2**2)
+    assert paths.contribution.item() == pytest.approx(expected, rel=1e-5)
+    assert paths.length.item() == pytest.approx(d1 + d2, rel=1e-6)
+    transient = model.transients(paths, torch.tensor([0]), NOTHING)[0]
+    assert transient.sum().item() == pytest.approx(expected, rel=1e-5)
+    mean = ((torch.arange(300) + 0.5) * transient).sum() / transient.sum()
+    assert mean.item() == pytest.approx((d1 + d2) / 0.01, abs=1e-3)
+
+
+def test_tilted_surfel_covers_its_cell_and_steep_one_keeps_its_length():
+    normal = torch.tensor([[0.6, 0.0, -0.8], [1.0, 0.0, 0.0]])
+    shift, area = spread(normal, torch.tensor([0.2, 0.1]), torch.tensor([[0.5, 0.5], [-0.5, 0.5]]))
+    # Slope 0.75: the footprint stays ±0.1 × 0.05, the height is ±0.075, the area 0.02/0.8.
+    assert shift[0, 0].tolist() == pytest.approx([0.1, 0.05, 0.075], abs=1e-6)
+    assert area.tolist() == pytest.approx([0.02 / 0.8, 0.02 / 0.4], rel=1e-6)
+    # Upright: no extent along x, 2.5 times the cell along z.
+    assert shift[1, 0].tolist() == pytest.approx([0.0, 0.05, 0.25], abs=1e-6)
+
+
+def test_spline_has_exact_energy_mean_and_variance_at_every_phase():
+    time = torch.linspace(20, 22, 41, dtype=torch.float64)[:, None]
+    first, weights = spline_weights(time)
+    bins = first[..., None] + torch.arange(4) + 0.5
+    exact = {"rtol": 0, "atol": 1e-12}
+    assert torch.allclose(weights.sum(-1), torch.ones_like(time), **exact)
+    assert torch.allclose((weights * bins).sum(-1), time, **exact)
+    assert torch.allclose(
+        (weights * (bins - time[..., None]) ** 2).sum(-1), torch.full_like(time, 1 / 3), **exact
+    )
+
+
+def test_splat_drops_what_leaves_the_window():
+    image = SplineSplat.apply(torch.tensor([[1.0, 1.0, 1.0]]), torch.tensor([[-7.0, 5.5, 99.0]]), 10)
+    assert image[0].tolist() == pytest.approx([0, 0, 0, 0, 1 / 6, 4 / 6, 1 / 6, 0, 0, 0], abs=1e-6)
+
+
+def test_plate_has_the_simulators_transients():
+    """The independent simulator carries ρ_w²ρ_p/π³ and bins without a splat: compare energies, means and variances per spot."""
+    scan = ScanPlan(
+        kind="single", nx=4, ny=3, width=1.0, height=0.6, fixed_point=(0.2, -0.1), bin_length=0.01, n_bins=300
+    )
+    laser, sensor = scan.points()
+    up = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
+    mesh = plate((0.1, 0.05, 0.7), 0.4, 0.2, turn_y=0.3)
+    truth = (
+        torch.from_numpy(simulate_transients(mesh, laser, sensor, up, up, bin_length=0.01, n_bins=300))
+        * math.pi**3
+    )
+    normal = np.array([math.sin(0.3), 0.0, math.cos(0.3)]) * -1
+    step = 0.4 * math.cos(0.3) / 8
+    xy = [((i - 3.5) * step, (j - 1.5) * 0.05) for i in range(8) for j in range(4)]
+    centre = [[0.1 + x, 0.05 + y, 0.7 - normal[0] / normal[2] * x] for x, y in xy]
+    model = build(wall(laser, sensor), centre, [normal.tolist()] * 32, quadrature=3, cell=0.05)
+    model.cell = torch.tensor([step, 0.05])
+    spots = torch.arange(12)
+    ours = model.transients(model.paths(spots), spots, NOTHING).double().detach()
+    bins = torch.arange(300) + 0.5
+    assert ours.sum(1) == pytest.approx(truth.sum(1), rel=2e-3)
+    mean, mean_truth = (ours @ bins.double()) / ours.sum(1), (truth @ bins.double()) / truth.sum(1)
+    assert mean == pytest.approx(mean_truth, abs=0.05)  # bins
+
+
+def test_render_adds_response_and_background_inside_the_gate():
+    model = build(wall([[0.0, 0.0, 0.0]], gate=(20, 300)), [[0.0, 0.0, 0.5]])
+    expected = model.render(torch.tensor([0]))[0]
+    assert expected.shape == (280,)
+    assert expected[:30].detach() == pytest.approx(torch.full((30,), 0.2), abs=1e-4)
+    energy = 100 * CELL**2 / 0.5**4
+    assert (expected - 0.2).sum().item() == pytest.approx(energy, rel=1e-3)
+    # Arrival at bin 100 plus the tail's mean delay 1/0.6.
+    bins = torch.arange(20, 300) + 0.5
+    assert (((expected - 0.2) * bins).sum() / energy).item() == pytest.approx(100 + 1 / 0.6, abs=0.05)
+
+
+@pytest.mark.parametrize("name", ["raw_depth", "raw_albedo", "raw_normal"])
+def test_gradient_of_render_agrees_with_finite_differences(name):
+    model, spots = random_model()
+    model.double()
+    probe = torch.randn(3, 260, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+    def value() -> torch.Tensor:
+        return (model.render(spots) * probe).sum()
+
+    parameter = getattr(model, name)
+    (gradient,) = torch.autograd.grad(value(), parameter)
+    for index in [(0,), (3,)] if parameter.ndim == 1 else [(0, 0), (3, 1)]:
+        step = 1e-3
+        sides = []
+        for sign in (1, -1):
+            with torch.no_grad():
+                parameter[index] += sign * step
+                sides.append(value().item())
+                parameter[index] -= sign * step
+        assert gradient[index].item() == pytest.approx((sides[0] - sides[1]) / (2 * step), rel=2e-3, abs=1e-6)
+
+
+def _with(model, depth, albedo, spots):
+    return torch.func.functional_call(model, {"raw_depth": depth, "raw_albedo": albedo}, (spots,))
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+def test_forward_mode_through_render_equals_reverse_mode():
+    model, spots = random_model()
+    shift = torch.randn(7, generator=torch.Generator().manual_seed(2))
+    probe = torch.randn(3, 260, generator=torch.Generator().manual_seed(3))
+    _, forward = torch.func.jvp(
+        lambda z: _with(model, z, model.raw_albedo, spots), (model.raw_depth.detach(),), (shift,)
+    )
+    (gradient,) = torch.autograd.grad((model.render(spots) * probe).sum(), model.raw_depth)
+    assert (forward * probe).sum().item() == pytest.approx((gradient @ shift).item(), rel=1e-3)
+
+
+def test_hooks_act_at_their_stages():
+    class Double(Hooks):
+        def path(self, contribution, paths, spots):
+            return 2 * contribution
+
+        def time(self, length, paths, spots):
+            return length + 0.03  # three bins
+
+        def gain(self, signal, spots):
+            return 3 * signal
+
+        def background(self, background, spots):
+            return 5 * background
+
+    model, spots = random_model()
+    plain, changed = model.render(spots) - 0.2, model.render(spots, Double()) - 1.0
+    assert torch.allclose(changed[:, 3:], 6 * plain[:, :-3], atol=1e-3 * changed.abs().max().item())
+    assert torch.equal(model.render(spots, Hooks()), model.render(spots))
+
+
+def test_a_batch_is_its_spots_one_by_one():
+    model, spots = random_model()
+    single = torch.cat([model.render(s[None]) for s in spots])
+    assert torch.allclose(model.expected(spots), single, rtol=1e-5, atol=1e-6)
+
+
+def test_front_sheet_hides_what_lies_behind_it_but_not_beside_it():
+    # A row of cells x = 0 … 4 at z = 0.5; targets behind its middle and beyond its edge.
+    index = torch.tensor([[i, j] for i in range(5) for j in range(3)])
+    sheet = front_sheet(index, torch.full((15,), 0.5), (12, 3))
+    origin, pitch = torch.tensor([0.0, 0.0]), torch.tensor([0.1, 0.1])
+    spots = torch.tensor([[0.2, 0.1, 0.0], [1.0, 0.1, 0.0]])
+    targets = torch.tensor([[0.2, 0.1, 1.0], [0.9, 0.1, 1.0]])
+    clear = clear_view(sheet, origin, pitch, spots, targets, samples=40, skip=0.0)
+    # From (1.0, 0.1) the first target is seen past the edge: at z = 0.5 the line is at x = 0.6.
+    assert clear.tolist() == [[False, True], [True, True]]
+
+
+def test_bending_vanishes_on_a_sphere_and_punishes_turned_normals():
+    angle = torch.tensor([[-0.1, 0.0], [0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
+    normal = torch.stack(
+        [angle[:, 0].sin(), angle[:, 1].sin(), -torch.sqrt(1 - angle.sin().square().sum(1))], 1
+    )
+    centre = normal * 0.5 + torch.tensor([0.0, 0.0, 1.5])
+    pairs = neighbour_pairs(centre, normal, 0.09)
+    assert len(pairs[0]) == 10  # every pair but the two farthest ends
+    weight = torch.ones(4)
+    assert bending(centre, normal, weight, pairs, stiffness=0.0).item() == pytest.approx(0, abs=1e-9)
+    turned = torch.nn.functional.normalize(normal + torch.tensor([0.2, 0.0, 0.0]), dim=1)
+    assert bending(centre, turned, weight, pairs, stiffness=0.0).item() > 0.1
+
+
+def test_state_restores_the_model():
+    model, spots = random_model()
+    model.update_visibility()
+    again = SurfelModel.from_state(_capture_of(model), model.state_dict())
+    assert torch.equal(again.render(spots), model.render(spots))
+    assert len(again) == 7
+
+
+def _capture_of(model: SurfelModel) -> Capture:
+    capture = wall(model.laser.double().numpy(), model.sensor.double().numpy(), gate=(40, 300))
+    assert capture.n_bins == 300
+    return capture
+
+
+def test_quadrature_is_centred():
+    assert quadrature(2).tolist() == [[-0.25, -0.25], [-0.25, 0.25], [0.25, -0.25], [0.25, 0.25]]
