@@ -1,4 +1,6 @@
-"""Say what the simulation gets wrong about a capture: ``python diagnose.py scene=su``, or ``run=FOLDER`` of a finished run."""
+"""Say what the simulation gets wrong about a capture: ``python diagnose.py scene=su``, or ``run=FOLDER`` of a
+finished run.
+"""
 
 from __future__ import annotations
 

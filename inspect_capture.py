@@ -17,7 +17,9 @@ from nlos_lit.capture.errors import UserError
 
 @dataclass(frozen=True)
 class Findings:
-    """What the counts say: ``mean`` ``[T]`` transient, ``totals`` ``[S]`` counts a spot inside the gate, and the rest."""
+    """What the counts say: ``mean`` ``[T]`` transient, ``totals`` ``[S]`` counts a spot inside the gate, and
+    the rest.
+    """
 
     mean: np.ndarray
     totals: np.ndarray
@@ -28,7 +30,9 @@ class Findings:
 
 
 def examine(capture: Capture) -> Findings:
-    """Direct pulse, depth of the first returns (half the path, m; one value a spot that has one) and what looks wrong."""
+    """Direct pulse, depth of the first returns (half the path, m; one value a spot that has one) and what
+    looks wrong.
+    """
     first, last = capture.gate
     mean = capture.counts.mean(axis=0, dtype=np.float64)
     totals = capture.counts[:, first:last].sum(axis=1, dtype=np.float64)
@@ -163,10 +167,12 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _first_returns(capture: Capture) -> np.ndarray:
-    """Half the path of the gated bin where a spot's transient, smoothed over 80 ps, rises past a fifth of its peak.
+    """Half the path of the gated bin where a spot's transient, smoothed over 80 ps, rises past a fifth of its
+    peak.
 
-    The rise is the one that leads to the peak, so a direct pulse's tail at the gate's start does not count. Spots whose peak does
-    not stand six standard deviations above their own lowest tenth are left out; of large scans every n-th spot is looked at.
+    The rise is the one that leads to the peak, so a direct pulse's tail at the gate's start does not count.
+    Spots whose peak does not stand six standard deviations above their own lowest tenth are left out; of
+    large scans every n-th spot is looked at.
     """
     first, last = capture.gate
     width = max(1, min(round(0.024 / capture.bin_length), last - first))
@@ -253,7 +259,9 @@ def _three(values: np.ndarray) -> str:
 
 
 def _on_wall(figure, axes, capture: Capture, values: np.ndarray, title: str) -> None:
-    """Values over the wall points, +x to the left and +y up, as one sees the wall's picture of the scene from the wall."""
+    """Values over the wall points, +x to the left and +y up, as one sees the wall's picture of the scene from
+    the wall.
+    """
     points = (
         capture.laser
         if np.ptp(capture.laser, axis=0).max() > np.ptp(capture.sensor, axis=0).max()

@@ -1,12 +1,14 @@
 """The paper's tables and figures, one command each: ``python results.py table1 figure7 size=full data=DIR``.
 
-NAMES are experiments, ``all``, or ``page``, which rewrites the generated parts of docs/results.md from what is stored.
+NAMES are experiments, ``all``, or ``page``, which rewrites the generated parts of docs/results.md from what
+is stored.
 
-size=full|reduced   full (default): real captures, renders and the bunny; about an hour on one core. reduced: small procedural
+size=full|reduced   full (default): real captures, renders and the bunny; about an hour on one core. reduced:
+small procedural
                     scenes in their places, every command once in a few minutes
 data=DIR            folder that is searched for captures and meshes (default: data)
-out=DIR             where results are kept and found again (default: outputs/evidence/SIZE); finished trainings are never repeated
-docs=FILE           the page (default: docs/results.md)
+out=DIR             where results are kept and found again (default: outputs/evidence/SIZE); finished
+trainings are never repeated docs=FILE           the page (default: docs/results.md)
 """
 
 from __future__ import annotations

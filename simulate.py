@@ -1,7 +1,8 @@
 """Simulate a capture of a hidden scene: ``python simulate.py scene=letters out=letters.hdf5 nx=64 ny=64``.
 
-Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen from the wall, and the mesh.
-With physical effects: ``python simulate.py scene=letters effects=[pile_up] pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
+Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen from
+the wall, and the mesh. With physical effects: ``python simulate.py scene=letters effects=[pile_up]
+pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
 """
 
 from __future__ import annotations
@@ -112,7 +113,9 @@ def build(scene: str, mesh: str | None) -> Mesh:
 
 
 def exposed(sensor: SensorModel, exposure: float) -> SensorModel:
-    """The sensor looking ``exposure`` times as long; counts per laser cycle, and so pile-up, stay what they are."""
+    """The sensor looking ``exposure`` times as long; counts per laser cycle, and so pile-up, stay what they
+    are.
+    """
     counts = ("mean_counts", "background", "direct_counts")
     return dataclasses.replace(sensor, **{name: exposure * getattr(sensor, name) for name in counts})
 

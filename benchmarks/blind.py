@@ -1,10 +1,12 @@
-"""The blind benchmark: hide effects in captures, diagnose the files, count what was found: ``python benchmarks/blind.py table``.
+"""The blind benchmark: hide effects in captures, diagnose the files, count what was found: ``python
+benchmarks/blind.py table``.
 
     python benchmarks/blind.py cases                the small seeded set that tests use a part of
-    python benchmarks/blind.py table                nulls, single effects, pairs, unknowns; some 2 hours of 2 cores
-    python benchmarks/blind.py report               docs/blind.md from what has been run so far
+    python benchmarks/blind.py table                nulls, single effects, pairs, unknowns; some 2 hours of 2
+    cores python benchmarks/blind.py report               docs/blind.md from what has been run so far
 
-Every diagnosis is stored as it is done (benchmarks/results/blind/), so that an interrupted run goes on where it was.
+Every diagnosis is stored as it is done (benchmarks/results/blind/), so that an interrupted run goes on where
+it was.
 """
 
 from __future__ import annotations
@@ -23,14 +25,15 @@ STORE = ROOT / "benchmarks" / "results" / "blind"
 MARK = "<!-- measured: python benchmarks/blind.py report -->"
 SCENES = ("default", "letters", "z_confocal", "sphere_before_plate")
 RENDERS = ("z_confocal", "bunny_confocal")
-CALM = 1500  # counts a spot up to which a render's Monte-Carlo noise (5 % a bin and more) stays below that of the counts
+# counts a spot up to which a render's Monte-Carlo noise (5 % a bin and more) stays below that of the counts
+CALM = 1500
 
 
 def table() -> dict[str, object]:
     """The captures by name, in such an order that a part of the run is a fair sample of the whole.
 
-    42 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 12 pairs, every unknown thrice;
-    scenes and photon levels in turn.
+    42 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 12 pairs, every
+    unknown thrice; scenes and photon levels in turn.
     """
     from blind_inject import EFFECTS, UNKNOWN
     from blind_truth import LEVELS, STRENGTHS, draw_spec

@@ -61,7 +61,9 @@ def overnamed(case: dict) -> bool:
 
 
 def missed_statistic(case: dict) -> float:
-    """What the oracle, told every hidden effect, gains beyond what was named: on the scale of the true statistic."""
+    """What the oracle, told every hidden effect, gains beyond what was named: on the scale of the true
+    statistic.
+    """
     return case["statistic"] * (1 - case["gain"] / case["oracle"]) if case["oracle"] else 0.0
 
 
@@ -191,7 +193,8 @@ def line(case: dict, mark: str) -> str:
 def tables(store: Path) -> str:
     """All tables as Markdown, of the outcomes of ``blind.py table``.
 
-    Outcomes that an older version has left in ``older`` stand in for captures that were not run since; they are marked.
+    Outcomes that an older version has left in ``older`` stand in for captures that were not run since; they
+    are marked.
     """
     now = {f.stem: json.loads(f.read_text()) for f in store.glob("[npsu]*_[0-9]*.json")}
     older = {f.stem: json.loads(f.read_text()) for f in (store / "older").glob("[npsu]*_[0-9]*.json")}

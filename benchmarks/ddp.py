@@ -1,10 +1,11 @@
 """What two processes send each other in an iteration: ``python benchmarks/ddp.py [names=SU] [sizes=tiny]``.
 
-Spots are shared by the processes, and DistributedDataParallel sums the gradients: 4 bytes for each voxel's albedo and for each of
-the six imaging parameters. The phasor field is whole in each process, or divided among them by depth (``shard_field=true`` of
-train.py): then each also hands over its slab of the volume, 4 bytes a voxel, and its gradient of the whole volume. Hooks count the
-bytes that are really handed over, and the gradients are compared with those of one process that holds everything and sees all
-spots. On Linux the bytes that really crossed the loopback device, of both processes together, stand beside them, counts of anything
+Spots are shared by the processes, and DistributedDataParallel sums the gradients: 4 bytes for each voxel's
+albedo and for each of the six imaging parameters. The phasor field is whole in each process, or divided among
+them by depth (``shard_field=true`` of train.py): then each also hands over its slab of the volume, 4 bytes a
+voxel, and its gradient of the whole volume. Hooks count the bytes that are really handed over, and the
+gradients are compared with those of one process that holds everything and sees all spots. On Linux the bytes
+that really crossed the loopback device, of both processes together, stand beside them, counts of anything
 else that uses it included. Rows go to benchmarks/results/speed/ddp/, and to standard output.
 """
 
@@ -49,7 +50,9 @@ def loopback_bytes() -> int | None:
 
 
 class Counter:
-    """Bytes handed to collectives: by DistributedDataParallel through its hook, and while it is open by the shared field."""
+    """Bytes handed to collectives: by DistributedDataParallel through its hook, and while it is open by the
+    shared field.
+    """
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -85,7 +88,9 @@ def gradients(module: nn.Module) -> Tensor:
 
 
 def work(rank: int, workload: Workload, folder: str) -> None:
-    """One process: its share of the batch, with the whole field and with its share of that; its count of bytes."""
+    """One process: its share of the batch, with the whole field and with its share of that; its count of
+    bytes.
+    """
     torch.set_num_threads(1)
     dist.init_process_group("gloo", init_method=f"file://{folder}/meet", rank=rank, world_size=RANKS)
     capture = synthetic_capture(workload)

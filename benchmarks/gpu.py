@@ -1,12 +1,12 @@
 """Table 2 on one GPU, with torch, numpy and nothing else: ``python benchmarks/gpu.py``.
 
-    python benchmarks/gpu.py                          the ten configurations at full size, every one to its last iteration
-    python benchmarks/gpu.py names=Bunny              Bunny alone: 100 iterations, set-up included
-    python benchmarks/gpu.py device=cpu sizes=tiny    the same path where there is no GPU
+    python benchmarks/gpu.py                          the ten configurations at full size, every one to its
+    last iteration python benchmarks/gpu.py names=Bunny              Bunny alone: 100 iterations, set-up
+    included python benchmarks/gpu.py device=cpu sizes=tiny    the same path where there is no GPU
 
-For each configuration: seconds of set-up, of an iteration and in all, the phasor product's bandwidth beside that of a copy on the
-same card, memory, and how often an iteration waited for the device (it must not). Rows go to benchmarks/results/speed/gpu/, a table
-is printed.
+For each configuration: seconds of set-up, of an iteration and in all, the phasor product's bandwidth beside
+that of a copy on the same card, memory, and how often an iteration waited for the device (it must not). Rows
+go to benchmarks/results/speed/gpu/, a table is printed.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python benchmarks/growth.py run [threads=1]
     python benchmarks/growth.py report        table and figure into docs/speed.md
 
-The wall, the scene and the volume's box stay the same; they are scanned, timed or divided more finely. Rows are stored as they are
-done (benchmarks/results/speed/growth/).
+The wall, the scene and the volume's box stay the same; they are scanned, timed or divided more finely. Rows
+are stored as they are done (benchmarks/results/speed/growth/).
 """
 
 from __future__ import annotations

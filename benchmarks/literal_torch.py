@@ -1,10 +1,11 @@
 """One training iteration as the paper formulates it, in batched torch, as fast as that formulation allows.
 
-Every depth and frequency is propagated by FFT in every iteration, every ray is sampled from the wall to the volume's far corner,
-and every path is spread over all time bins. What the formulation leaves open is taken in its favour: one FFT of the wall's field
-per frequency and one inverse per depth; distances once per depth; frequencies only within 5.5/σ of Ω_pf (at 4/σ gradients are off
-by 1 %); the propagation's gradient written out; only rays that meet something become paths. Planes and rays are worked on in
-blocks that fit memory, and what the backward pass needs of a block is computed again, as it would otherwise take tens of GiB.
+Every depth and frequency is propagated by FFT in every iteration, every ray is sampled from the wall to the
+volume's far corner, and every path is spread over all time bins. What the formulation leaves open is taken in
+its favour: one FFT of the wall's field per frequency and one inverse per depth; distances once per depth;
+frequencies only within 5.5/σ of Ω_pf (at 4/σ gradients are off by 1 %); the propagation's gradient written
+out; only rays that meet something become paths. Planes and rays are worked on in blocks that fit memory, and
+what the backward pass needs of a block is computed again, as it would otherwise take tens of GiB.
 """
 
 from __future__ import annotations
@@ -49,10 +50,12 @@ class _Propagation(torch.autograd.Function):
 
 
 class LiteralIteration:
-    """The same parameters, batch and objective as ``training`` (profile "paper", confocal, volume below the scan).
+    """The same parameters, batch and objective as ``training`` (profile "paper", confocal, volume below the
+    scan).
 
     Args:
-        precision: float32 shares the parameters of ``training``; float64 has copies of them, and is what rounding is judged by.
+        precision: float32 shares the parameters of ``training``; float64 has copies of them, and is what
+            rounding is judged by.
         reach: frequencies up to this many 1/σ_pf from Ω_pf; infinite takes all that the package has.
     """
 
@@ -96,7 +99,9 @@ class LiteralIteration:
         self.ffts = len(self.omega) * (1 + 2 * len(self.depth)) + 2 * len(self.depth)
 
     def products(self, z: float) -> Tensor:
-        """``[F, lx, ly]``: transform of the wall's field times that of every frequency's kernel for depth ``z``."""
+        """``[F, lx, ly]``: transform of the wall's field times that of every frequency's kernel for depth
+        ``z``.
+        """
         distance = torch.sqrt(self.lateral + z * z)
         turns = torch.remainder(self.omega[:, None, None] * (-2 * distance), 2 * math.pi).to(self.precision)
         kernel = torch.polar((1 / distance**2).to(self.precision).expand_as(turns), turns)

@@ -1,4 +1,5 @@
-"""Our iteration against a literal one of the paper's formulation, side by side in one process: ``python benchmarks/ratio.py``.
+"""Our iteration against a literal one of the paper's formulation, side by side in one process: ``python
+benchmarks/ratio.py``.
 
     python benchmarks/ratio.py sizes        three sizes, interleaved
     python benchmarks/ratio.py accuracy     loss and gradients of both against float64, at the same sizes
@@ -6,8 +7,8 @@
     python benchmarks/ratio.py report       tables and figure into docs/speed.md
     threads=1                               beside any of them: threads of torch
 
-Every row is stored as it is done (benchmarks/results/speed/), so that an interrupted run goes on. Seconds are the process's
-own, with one thread: on a machine that others use, too, two threads wait for each other.
+Every row is stored as it is done (benchmarks/results/speed/), so that an interrupted run goes on. Seconds are
+the process's own, with one thread: on a machine that others use, too, two threads wait for each other.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ GROWTH = {
 def evaluate(
     iteration: Training | LiteralIteration, spots: torch.Tensor, counts: torch.Tensor
 ) -> dict[str, torch.Tensor]:
-    """Data term, loss, and the data term's gradients: the paper's λ1 = 100 would hide them under the sparsity's."""
+    """Data term, loss, and the data term's gradients: the paper's λ1 = 100 would hide them under the
+    sparsity's.
+    """
     phasor, sensor, albedo = (
         iteration.pipeline.phasor,
         iteration.pipeline.laser_sensor,
@@ -65,7 +68,9 @@ def relative(found: dict[str, torch.Tensor], expected: dict[str, torch.Tensor]) 
 
 
 def errors(workload: Workload) -> dict[str, object]:
-    """Relative errors of both against the literal formulation in float64 with all frequencies, at the same parameters and batch."""
+    """Relative errors of both against the literal formulation in float64 with all frequencies, at the same
+    parameters and batch.
+    """
     training = Training(workload, synthetic_capture(workload), profile="paper")
     training.prepare()
     batch = training.batch()
@@ -75,7 +80,9 @@ def errors(workload: Workload) -> dict[str, object]:
 
 
 def compare(workload: Workload, repeats: int) -> dict[str, object]:
-    """Seconds an iteration of both in turns, on the same batches; and of model=default, which has no literal counterpart."""
+    """Seconds an iteration of both in turns, on the same batches; and of model=default, which has no literal
+    counterpart.
+    """
     capture = synthetic_capture(workload)
     paper, default = (Training(workload, capture, profile=profile) for profile in ("paper", "default"))
     setup, _ = seconds(paper.prepare), default.prepare()

@@ -17,7 +17,9 @@ PAGE = ROOT / "docs" / "speed.md"
 
 
 def perform(tasks: dict[str, Callable[[], None]], arguments: Sequence[str], usage: str) -> None:
-    """The tasks named among ``arguments``, all of them where none is, with ``threads=N`` of torch (one if not given)."""
+    """The tasks named among ``arguments``, all of them where none is, with ``threads=N`` of torch (one if not
+    given).
+    """
     given = dict(a.split("=", 1) for a in arguments if "=" in a)
     chosen = [a for a in arguments if "=" not in a] or list(tasks)
     if not set(chosen) <= set(tasks) or not set(given) <= {"threads"}:

@@ -3,13 +3,13 @@
     python benchmarks/table2.py run [names=SU,Bunny] [threads=1] [seconds=900]
     python benchmarks/table2.py report        table and figure into docs/speed.md
 
-Each configuration runs in a fresh process, so that its peak memory is its own, and to the paper's number of iterations where they
-take less than ``seconds``; otherwise 12 iterations are measured, and the total is projected and marked so. Rows are stored as
-they are done (benchmarks/results/speed/table2/).
+Each configuration runs in a fresh process, so that its peak memory is its own, and to the paper's number of
+iterations where they take less than ``seconds``; otherwise 12 iterations are measured, and the total is
+projected and marked so. Rows are stored as they are done (benchmarks/results/speed/table2/).
 
-Both the wall's clock and the process's own time are kept: with one thread the latter is what a core of its own would take, whatever
-else the machine does. Erato and Indonesian have Dragon's sizes and NLOS has 44i's, so their rows take these
-measurements with their own number of iterations.
+Both the wall's clock and the process's own time are kept: with one thread the latter is what a core of its
+own would take, whatever else the machine does. Erato and Indonesian have Dragon's sizes and NLOS has 44i's,
+so their rows take these measurements with their own number of iterations.
 """
 
 from __future__ import annotations
@@ -121,7 +121,9 @@ def report() -> None:
 
 
 def draw(minutes: dict[str, tuple[float, float, float]]) -> None:
-    """Bars of minutes by scene (paper; ours in the process's own time; ours on the wall's clock) into docs/images/table2.png."""
+    """Bars of minutes by scene (paper; ours in the process's own time; ours on the wall's clock) into
+    docs/images/table2.png.
+    """
     from matplotlib.figure import Figure
 
     from nlos_lit.report.style import save_figure

@@ -12,7 +12,9 @@ import torch
 
 
 def seconds(work: Callable[[], Any]) -> float:
-    """Of the process's own time: with one thread what a core of its own would take, whatever else the machine does."""
+    """Of the process's own time: with one thread what a core of its own would take, whatever else the machine
+    does.
+    """
     began = time.process_time()
     work()
     return time.process_time() - began

@@ -1,7 +1,9 @@
-"""Workloads for the speed benchmarks: captures of given sizes, and the training iteration that train.py runs. Only torch and numpy.
+"""Workloads for the speed benchmarks: captures of given sizes, and the training iteration that train.py runs.
+Only torch and numpy.
 
-The captures are cheap sums over the points of a surface (a dome in front of a tilted plate) with Poisson noise: sizes, occupied
-volume and rays that meet something are those of real scenes, and that is what an iteration's time depends on.
+The captures are cheap sums over the points of a surface (a dome in front of a tilted plate) with Poisson
+noise: sizes, occupied volume and rays that meet something are those of real scenes, and that is what an
+iteration's time depends on.
 """
 
 from __future__ import annotations
@@ -123,7 +125,9 @@ TABLE_2 = (
 
 
 def tiny(workload: Workload) -> Workload:
-    """The same kind of scan at a size for tests: a sixteenth of the spots along each axis, few bins, planes and rays."""
+    """The same kind of scan at a size for tests: a sixteenth of the spots along each axis, few bins, planes
+    and rays.
+    """
     shrink = 16 if workload.confocal and workload.spots[0] > 64 else 8
     spots = tuple(max(6, n // shrink) for n in workload.spots)
     wall = workload.pitch * workload.spots[0]
@@ -145,7 +149,9 @@ def tiny(workload: Workload) -> Workload:
 
 
 def surface_points(workload: Workload, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Points ``[P, 3]`` of a dome in front of a tilted plate, about ``spacing`` apart, and their albedos ``[P]``."""
+    """Points ``[P, 3]`` of a dome in front of a tilted plate, about ``spacing`` apart, and their albedos
+    ``[P]``.
+    """
     half = 0.5 * workload.pitch * min(workload.spots)
     near, span = workload.depth, workload.planes * workload.plane_pitch
     count = max(5, math.ceil(half / spacing))

@@ -46,7 +46,9 @@ def load_scene(
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
-    """The scene's file: ``path`` as given, else that in ``data_dir``, else downloaded where a URL and a checksum are known."""
+    """The scene's file: ``path`` as given, else that in ``data_dir``, else downloaded where a URL and a
+    checksum are known.
+    """
     if scene["path"] is not None:
         path = Path(scene["path"])
         if not path.exists():

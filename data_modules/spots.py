@@ -18,10 +18,11 @@ log = logging.getLogger(__name__)
 
 
 def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
-    """``[S]`` True where a spot is held out: every ``every``-th ``block × block`` patch of the wall, patches staggered row by row.
+    """``[S]`` True where a spot is held out: every ``every``-th ``block × block`` patch of the wall, patches
+    staggered row by row.
 
-    Contiguous patches, because random spots would leak through their neighbours. Without a scanned grid, runs of ``block²``
-    neighbouring rows of the capture take the place of patches. ``every = 0`` holds out nothing.
+    Contiguous patches, because random spots would leak through their neighbours. Without a scanned grid, runs
+    of ``block²`` neighbouring rows of the capture take the place of patches. ``every = 0`` holds out nothing.
     """
     if every == 0:
         return np.zeros(capture.n_spots, dtype=bool)
@@ -118,7 +119,8 @@ class CaptureDataModule(L.LightningDataModule):
         self.capture, self.batch, self.seed = capture, batch, seed
         self.dataset = SpotDataset(capture)
         held = heldout_mask(capture, block, every)
-        # A spot without a single gated count was not measured (figure 4 has a hole of 100): it says nothing about a model.
+        # A spot without a single gated count was not measured (figure 4 has a hole of 100): it says nothing
+        # about a model.
         measured = self.dataset.counts.sum(1).numpy() > 0
         if not measured.all():
             empty = int((~measured).sum())

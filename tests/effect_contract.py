@@ -30,7 +30,9 @@ HOOKS = {
 
 
 def capture(kind: str) -> Capture:
-    """Ten scattered spots, ``confocal``, ``single`` (one laser point) or ``exhaustive`` (both points vary); 64 bins."""
+    """Ten scattered spots, ``confocal``, ``single`` (one laser point) or ``exhaustive`` (both points vary);
+    64 bins.
+    """
     rng = np.random.default_rng(5)
     wall = rng.uniform(-0.4, 0.4, (2, SPOTS, 3)) * [1, 0.7, 0] + [0.1, -0.05, 0]
     laser = {
@@ -94,7 +96,8 @@ def probe(shape: torch.Size, seed: int = 1) -> Tensor:
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 class EffectContract:
-    """``class TestMine(EffectContract, effect=Mine, strength=0.2, decay=0.1)``: every parameter well away from its null.
+    """``class TestMine(EffectContract, effect=Mine, strength=0.2, decay=0.1)``: every parameter well away
+    from its null.
 
     Coefficients get from a fifth of the value to all of it.
     """

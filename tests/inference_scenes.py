@@ -37,7 +37,9 @@ def double_precision() -> Iterator[None]:
 def capture_of(
     wall: np.ndarray, kind: str = "confocal", counts: np.ndarray | None = None, **options: object
 ) -> Capture:
-    """Spots at ``wall`` ``[S, 2]``, ``confocal``, ``single`` (one laser point) or ``exhaustive`` (shuffled lasers)."""
+    """Spots at ``wall`` ``[S, 2]``, ``confocal``, ``single`` (one laser point) or ``exhaustive`` (shuffled
+    lasers).
+    """
     rng = np.random.default_rng(5)
     sensor = np.column_stack([wall, np.zeros(len(wall))])
     laser = {
@@ -66,7 +68,9 @@ def raster(nx: int, ny: int | None = None, width: float = 0.8) -> np.ndarray:
 
 
 def surfels(scene: Capture, number: int = 12, level: float = 1.0) -> SurfelModel:
-    """Surfels on the two sides of a valley, the last so steep that it moves along its normal; counts grow with ``level``."""
+    """Surfels on the two sides of a valley, the last so steep that it moves along its normal; counts grow
+    with ``level``.
+    """
     rng = np.random.default_rng(6)
     xy = rng.uniform(-0.25, 0.25, (number, 2))
     centre = np.column_stack([xy, 0.7 - 0.8 * np.abs(xy[:, 0])])
@@ -119,7 +123,9 @@ def uneven(effect: Effect) -> Effect:
 def drawn(
     model: SurfelModel, extension: Extension, scene: Capture, seed: int = 0, factor: Tensor | float = 1.0
 ) -> Capture:
-    """The capture with counts drawn from the model times ``factor`` (broadcast to ``[S, T_gate]``), zeros before the gate."""
+    """The capture with counts drawn from the model times ``factor`` (broadcast to ``[S, T_gate]``), zeros
+    before the gate.
+    """
     expected = (model.expected(torch.arange(scene.n_spots), extension) * factor).double().numpy()
     counts = np.zeros(scene.counts.shape, dtype=np.uint32)
     counts[:, scene.gate[0] :] = np.random.default_rng(seed).poisson(expected)
@@ -170,6 +176,8 @@ def candidate(
 
 
 def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:
-    """Log-likelihoods of 120 spots that are ``mean`` each on average, exactly, and scatter from block to block."""
+    """Log-likelihoods of 120 spots that are ``mean`` each on average, exactly, and scatter from block to
+    block.
+    """
     values = np.repeat(np.random.default_rng(seed).standard_normal(40), 3)
     return torch.from_numpy(mean + scatter * (values - values.mean()) / values.std())

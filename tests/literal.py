@@ -1,8 +1,9 @@
-"""The paper's equations written out: dense, slow, float64. Nothing here shares code with the package; tests compare the two.
+"""The paper's equations written out: dense, slow, float64. Nothing here shares code with the package; tests
+compare the two.
 
-Everything is evaluated where the paper evaluates it: every frequency of the virtual illumination, every spot and voxel, every
-sample of every ray, every time bin of every path. Equation and section numbers are the paper's. Lengths in metres, time as
-optical path length.
+Everything is evaluated where the paper evaluates it: every frequency of the virtual illumination, every spot
+and voxel, every sample of every ray, every time bin of every path. Equation and section numbers are the
+paper's. Lengths in metres, time as optical path length.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ def bounded(raw: Tensor, lower: float, upper: float) -> Tensor:
 
 
 def voxel_centres(origin, pitch, shape) -> Tensor:
-    """``[nz, nx, ny, 3]`` centres of a grid given by ``(x, y, z)`` origin and pitch and ``(nz, nx, ny)`` shape."""
+    """``[nz, nx, ny, 3]`` centres of a grid given by ``(x, y, z)`` origin and pitch and ``(nz, nx, ny)``
+    shape.
+    """
     nz, nx, ny = shape
     centres = torch.empty(nz, nx, ny, 3, dtype=DOUBLE)
     centres[..., 0] = (origin[0] + pitch[0] * torch.arange(nx, dtype=DOUBLE))[None, :, None]
@@ -41,7 +44,9 @@ def voxel_centres(origin, pitch, shape) -> Tensor:
 def propagate(
     counts: Tensor, time: Tensor, laser: Tensor, sensor: Tensor, voxels: Tensor, omega: Tensor
 ) -> Field:
-    """The inner integrals of Eq. 2 for every frequency: ``Σ_s e^{-iΩ(d_lv + d_vs)}/(d_lv d_vs) Σ_t H[s, t] e^{iΩt}``."""
+    """The inner integrals of Eq. 2 for every frequency: ``Σ_s e^{-iΩ(d_lv + d_vs)}/(d_lv d_vs) Σ_t H[s, t]
+    e^{iΩt}``.
+    """
     flat = voxels.reshape(-1, 3)
     to_laser = torch.linalg.vector_norm(flat[:, None] - laser, dim=2)
     to_sensor = torch.linalg.vector_norm(flat[:, None] - sensor, dim=2)
@@ -54,7 +59,9 @@ def propagate(
 
 
 def frequencies(omega_pf: float, sigma_pf: float, longest: float, widths: float = 6.5) -> Tensor:
-    """Equally spaced over all that the virtual pulse contains, negative ones too, fine enough for paths up to ``longest``."""
+    """Equally spaced over all that the virtual pulse contains, negative ones too, fine enough for paths up to
+    ``longest``.
+    """
     step = 2 * math.pi / (longest + 2 * widths * sigma_pf)
     half = math.ceil(widths / sigma_pf / step)
     return omega_pf + step * torch.arange(-half, half + 1, dtype=DOUBLE)
@@ -78,7 +85,9 @@ def intensity(
 
 
 def pulse_intensity(counts, time, laser, sensor, voxels, omega_pf: float, sigma_pf: float) -> Tensor:
-    """``|u|`` of Eq. 2 in the time domain: each photon contributes the virtual pulse at (its time - the path's length)."""
+    """``|u|`` of Eq. 2 in the time domain: each photon contributes the virtual pulse at (its time - the
+    path's length).
+    """
     flat = voxels.reshape(-1, 3)
     to_laser = torch.linalg.vector_norm(flat[:, None] - laser, dim=2)
     to_sensor = torch.linalg.vector_norm(flat[:, None] - sensor, dim=2)
@@ -91,7 +100,9 @@ def pulse_intensity(counts, time, laser, sensor, voxels, omega_pf: float, sigma_
 
 
 def concentric_directions(n: int) -> Tensor:
-    """``[n·n, 3]``: centres of an n × n grid through Shirley and Chiu's square → disk → hemisphere map, one at a time."""
+    """``[n·n, 3]``: centres of an n × n grid through Shirley and Chiu's square → disk → hemisphere map, one
+    at a time.
+    """
     rows = []
     for i in range(n):
         for j in range(n):
@@ -120,7 +131,9 @@ def local_frame(normal: Tensor) -> Tensor:
 
 
 def interpolate(volume: Tensor, points: Tensor, origin, pitch) -> tuple[Tensor, Tensor]:
-    """Trilinear values at ``points`` ``[M, 3]``, and which of them lie inside the box of voxel centres; 0 outside it."""
+    """Trilinear values at ``points`` ``[M, 3]``, and which of them lie inside the box of voxel centres; 0
+    outside it.
+    """
     nz, nx, ny = volume.shape
     steps = (points - torch.tensor(origin, dtype=DOUBLE)) / torch.tensor(pitch, dtype=DOUBLE)
     u, v, w = steps.unbind(1)
@@ -158,10 +171,11 @@ class Points(NamedTuple):
 def surface(
     volume, origin, pitch, wall, wall_normal, n, threshold, step, beta, farthest, fine: int | None = None
 ) -> Points:
-    """Sec. 4.2: every ray, every sample, softargmax over all of them with intensities below the threshold set to zero.
+    """Sec. 4.2: every ray, every sample, softargmax over all of them with intensities below the threshold set
+    to zero.
 
-    With ``fine`` (not in the paper) the softargmax runs over ``2·fine + 1`` samples from one step before to one step behind the
-    largest one instead, and β applies to intensities relative to the largest of these.
+    With ``fine`` (not in the paper) the softargmax runs over ``2·fine + 1`` samples from one step before to
+    one step behind the largest one instead, and β applies to intensities relative to the largest of these.
     """
     spots = len(wall)
     frames = torch.stack([local_frame(m) for m in wall_normal])
@@ -195,7 +209,8 @@ def surface(
 def normals(hit: Tensor, point: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of the normals of the triangles N-E-S and S-W-N of the neighbouring rays' points, towards the wall.
 
-    A neighbour without a surface is replaced by the ray's own point; a ray with neither of two opposite neighbours has none.
+    A neighbour without a surface is replaced by the ray's own point; a ray with neither of two opposite
+    neighbours has none.
     """
 
     def shifted(di: int, dj: int) -> tuple[Tensor, Tensor]:
@@ -223,7 +238,9 @@ def normals(hit: Tensor, point: Tensor, direction: Tensor) -> tuple[Tensor, Tens
 def contributions(
     found: Points, albedo: Tensor, laser, laser_normal, sensor, sensor_normal, n: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Eq. 5-6 of every ray with a surface: (K, path length, spot), each path integrated over the area its ray sees."""
+    """Eq. 5-6 of every ray with a surface: (K, path length, spot), each path integrated over the area its ray
+    sees.
+    """
     spot, row, column = torch.nonzero(found.valid, as_tuple=True)
     point, normal = found.point[spot, row, column], found.normal[spot, row, column]
     to_light, to_eye = laser[spot] - point, sensor[spot] - point
@@ -239,7 +256,9 @@ def contributions(
 
 
 def rendered_transients(k, path, spot, n_spots, n_bins, bin_length, t_start, sigma_t, normalise) -> Tensor:
-    """Eq. 7-9: every path spread over all bins by the Gaussian in bins; ``normalise`` divides by its sum over the whole axis."""
+    """Eq. 7-9: every path spread over all bins by the Gaussian in bins; ``normalise`` divides by its sum over
+    the whole axis.
+    """
     margin = 40
     index = torch.arange(-margin, n_bins + margin, dtype=DOUBLE) + 0.5
     arrival = (path - t_start) / bin_length
@@ -251,16 +270,19 @@ def rendered_transients(k, path, spot, n_spots, n_bins, bin_length, t_start, sig
 
 
 def psi(sigma: Tensor, kappa: Tensor, first: int, last: int, fine: int = 64) -> Tensor:
-    """Eq. 10 per bin, without I_l: a sampled exponential convolved with a sampled Gaussian, then summed over each bin.
+    """Eq. 10 per bin, without I_l: a sampled exponential convolved with a sampled Gaussian, then summed over
+    each bin.
 
     Args:
-        sigma, kappa: in bins and per bin; first, last: bins before and after the arrival, ``[last - first + 1]`` results.
+        sigma, kappa: in bins and per bin; first, last: bins before and after the arrival, ``[last - first +
+            1]`` results.
     """
     dt = 1 / fine
     length = math.ceil(32 / float(kappa.detach()) / dt)
     decay = kappa * torch.exp(-kappa * (torch.arange(length, dtype=DOUBLE) + 0.5) * dt) * dt
     bins = last - first + 1
-    # Sub-bin m lies at first - 1/2 + (m + 1/2) dt, the exponential's sample j at (j + 1/2) dt: their differences are a grid again.
+    # Sub-bin m lies at first - 1/2 + (m + 1/2) dt, the exponential's sample j at (j + 1/2) dt: their
+    # differences are a grid again.
     lag = first - 0.5 + torch.arange(1 - length, bins * fine, dtype=DOUBLE) * dt
     gauss = torch.exp(-(lag**2) / (2 * sigma**2)) / (sigma * math.sqrt(2 * math.pi))
     sampled = torch.nn.functional.conv1d(gauss[None, None], decay.flip(0)[None, None])[0, 0]
@@ -268,7 +290,9 @@ def psi(sigma: Tensor, kappa: Tensor, first: int, last: int, fine: int = 64) -> 
 
 
 def sensed(rendered: Tensor, sigma: Tensor, kappa: Tensor, gain: Tensor, background: Tensor) -> Tensor:
-    """Eq. 11: ``H_R[τ] = I_l Σ_τ' Ψ(τ - τ') H_r[τ'] + η_s``, the sum written as a matrix over all pairs of bins."""
+    """Eq. 11: ``H_R[τ] = I_l Σ_τ' Ψ(τ - τ') H_r[τ'] + η_s``, the sum written as a matrix over all pairs of
+    bins.
+    """
     bins = rendered.shape[1]
     share = psi(sigma, kappa, 1 - bins, bins - 1)
     pair = torch.arange(bins)[:, None] - torch.arange(bins) + bins - 1
@@ -276,7 +300,9 @@ def sensed(rendered: Tensor, sigma: Tensor, kappa: Tensor, gain: Tensor, backgro
 
 
 def splat_variance(sigma_t: float) -> float:
-    """Mean squared distance in bins from arrival to bin centre under the normalised Gaussian, over all sub-bin phases."""
+    """Mean squared distance in bins from arrival to bin centre under the normalised Gaussian, over all
+    sub-bin phases.
+    """
     total = 0.0
     for phase in range(1000):
         arrival = (phase + 0.5) / 1000

@@ -88,7 +88,9 @@ def wall(case: Case, rng: np.random.Generator):
 
 
 def transients(laser, sensor, rng: np.random.Generator) -> np.ndarray:
-    """Two tilted plates and a lone scatterer as sums of points, each a short pulse of 1/(d_l² d_s²) at its path length."""
+    """Two tilted plates and a lone scatterer as sums of points, each a short pulse of 1/(d_l² d_s²) at its
+    path length.
+    """
     u, v = (c.reshape(-1, 1) for c in np.meshgrid(np.linspace(-1, 1, 9), np.linspace(-1, 1, 9)))
     first = np.array([-0.1, 0.09, 0.47]) + u * [0.1, 0.01, 0.04] + v * [0.0, 0.12, -0.03]
     second = np.array([0.13, -0.12, 0.66]) + u * [0.08, 0.0, -0.05] + v * [0.01, 0.09, 0.02]

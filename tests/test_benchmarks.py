@@ -1,4 +1,6 @@
-"""The benchmarks at tiny sizes: same numbers from the literal iteration, a GPU path that needs torch alone, honest sizes."""
+"""The benchmarks at tiny sizes: same numbers from the literal iteration, a GPU path that needs torch alone,
+honest sizes.
+"""
 
 from __future__ import annotations
 

@@ -90,7 +90,9 @@ def test_importing_the_package_loads_no_framework():
 
 
 def test_no_module_imports_open3d_when_it_is_imported():
-    """Inside functions only, so that everything but meshes and ray casting works without its system libraries."""
+    """Inside functions only, so that everything but meshes and ray casting works without its system
+    libraries.
+    """
     offenders = []
     for name in MODULES:
         body = [

@@ -1,6 +1,7 @@
 """Captures from the public file formats of the field, one format a module, all turned into the world frame.
 
-World frame: relay wall near z = 0, hidden scene at z > 0, right-handed, metres. Seen from the wall with +y up, +x points left.
+World frame: relay wall near z = 0, hidden scene at z > 0, right-handed, metres. Seen from the wall with +y
+up, +x points left.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ def read_capture(path: str | Path, fmt: str = "auto", *, options: ReaderOptions 
     """Read a capture; ``fmt`` forces a format instead of recognising it from the file's content.
 
     Raises:
-        CaptureError: no such file, unknown format, damaged or unusable data, or an option that the format cannot use.
+        CaptureError: no such file, unknown format, damaged or unusable data, or an option that the format
+            cannot use.
     """
     options = options or ReaderOptions()
     contents = open_contents(path)

@@ -105,14 +105,18 @@ def cell_centres(number: int, side: float) -> np.ndarray:
 
 
 def wall_points(first: np.ndarray, second: np.ndarray, axes: str) -> np.ndarray:
-    """``[n₁·n₂, 3]`` points at z = 0 of a grid whose first and second file axis run along ``axes`` (``xy`` or ``yx``)."""
+    """``[n₁·n₂, 3]`` points at z = 0 of a grid whose first and second file axis run along ``axes`` (``xy`` or
+    ``yx``).
+    """
     a, b = (grid.ravel() for grid in np.meshgrid(first, second, indexing="ij"))
     x, y = (a, b) if axes == "xy" else (b, a)
     return np.stack([x, y, np.zeros_like(x)], axis=1)
 
 
 def ascending_order(shape: tuple[int, ...], laser: np.ndarray, sensor: np.ndarray) -> np.ndarray:
-    """File rows of a scan ``[n₁, n₂]`` or ``[l₁, l₂, s₁, s₂]``, with each pair of axes turned so that it runs along +x, +y."""
+    """File rows of a scan ``[n₁, n₂]`` or ``[l₁, l₂, s₁, s₂]``, with each pair of axes turned so that it runs
+    along +x, +y.
+    """
     order = np.arange(len(laser)).reshape(shape)
     scanned = laser if np.ptp(laser, axis=0).max() > 0 else sensor
     for axis in range(0, len(shape), 2):
@@ -134,7 +138,9 @@ def _run(points: np.ndarray, order: np.ndarray, axis: int) -> np.ndarray:
 
 
 def grid_of(points: np.ndarray) -> tuple[np.ndarray, tuple[int, int]] | None:
-    """Order and shape ``(nx, ny)`` in which listed points fill a rectangular grid exactly once; None where they do not."""
+    """Order and shape ``(nx, ny)`` in which listed points fill a rectangular grid exactly once; None where
+    they do not.
+    """
     (column, nx), (row, ny) = _lines(points[:, 0]), _lines(points[:, 1])
     if nx * ny != len(points):
         return None
@@ -190,8 +196,8 @@ def remove_delays(counts: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, f
         delays: ``[S]`` in bins, not negative.
 
     Returns:
-        ``[S, T - longest]`` counts (no bin wraps round or is made up), the mean of what rounding left over (bins, to be added
-        to the time of bin 0), and a sentence for the provenance.
+        ``[S, T - longest]`` counts (no bin wraps round or is made up), the mean of what rounding left over
+        (bins, to be added to the time of bin 0), and a sentence for the provenance.
     """
     if not np.isfinite(delays).all() or delays.min() < 0:
         raise CaptureError("the delays to take off each spot must be finite and not negative")
@@ -225,7 +231,9 @@ def smooth(transient: np.ndarray, width: int) -> np.ndarray:
 
 
 def direct_pulse(mean: np.ndarray, bin_length: float, t_start: float = 0.0) -> int | None:
-    """Bin of the wall's own return: the highest bin of the mean transient ``[T]``, if it comes within 0.3 m of path zero."""
+    """Bin of the wall's own return: the highest bin of the mean transient ``[T]``, if it comes within 0.3 m
+    of path zero.
+    """
     peak = int(np.argmax(mean))
     return peak if abs(t_start + (peak + 0.5) * bin_length) < DIRECT_PULSE_PATH else None
 
@@ -235,9 +243,9 @@ def gate_after_direct_pulse(
 ) -> tuple[tuple[int, int], str]:
     """Bins behind the wall's own return.
 
-    The mean transient has a valley between the pulse's tail and the largest later rise above the lowest level so far. The gate
-    begins where the tail, above that valley, has sunk below 1e-4 of the pulse's peak for good. Without a later rise: 0.72 m of
-    path (2.4 ns) behind the pulse.
+    The mean transient has a valley between the pulse's tail and the largest later rise above the lowest level
+    so far. The gate begins where the tail, above that valley, has sunk below 1e-4 of the pulse's peak for
+    good. Without a later rise: 0.72 m of path (2.4 ns) behind the pulse.
 
     Returns:
         ``(first, last)`` and a sentence for the provenance; all bins where there is no direct pulse.

@@ -1,4 +1,6 @@
-"""Confocal renders of Chen et al. (Learned feature embeddings, SIGGRAPH Asia 2020): one Radiance HDR picture ``[T·N, N]``."""
+"""Confocal renders of Chen et al. (Learned feature embeddings, SIGGRAPH Asia 2020): one Radiance HDR picture
+``[T·N, N]``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Any pairs of laser and detector points as ``C_i``, ``C_d``, ``sub_Sig`` (Liu et al., Nat. Commun. 14, 3230, 2023)."""
+"""Any pairs of laser and detector points as ``C_i``, ``C_d``, ``sub_Sig`` (Liu et al., Nat. Commun. 14, 3230,
+2023).
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def matches(contents: Contents) -> bool:
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Times are paths from laser to detector point. The bins that the file leaves empty at both ends are outside the gate."""
+    """Times are paths from laser to detector point. The bins that the file leaves empty at both ends are
+    outside the gate.
+    """
     contents = open_contents(path)
     if not contents.has(*_KEYS) and contents.container != "folder":
         contents = open_folder(path.parent)
@@ -63,7 +67,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 def _world(
     laser: np.ndarray, sensor: np.ndarray, options: ReaderOptions
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Columns (depth, horizontal, vertical) to (x, y, z) in metres, the scanned rectangle's middle at the origin."""
+    """Columns (depth, horizontal, vertical) to (x, y, z) in metres, the scanned rectangle's middle at the
+    origin.
+    """
     scanned = laser if np.ptp(laser, axis=0).max() >= np.ptp(sensor, axis=0).max() else sensor
     low, high = scanned[:, 1:].min(axis=0), scanned[:, 1:].max(axis=0)
     scale = (UNIT, UNIT)

@@ -1,7 +1,8 @@
 """What lies in a file, seen without reading its arrays: the one place where file libraries are touched.
 
-Nothing here can run code from a file: MATLAB objects and function handles, HDF5 references and Python objects are never
-resolved, only plain numbers and text are read. Every failure of a library on a damaged file becomes one `CaptureError`.
+Nothing here can run code from a file: MATLAB objects and function handles, HDF5 references and Python objects
+are never resolved, only plain numbers and text are read. Every failure of a library on a damaged file becomes
+one `CaptureError`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zli
 
 @dataclass(frozen=True)
 class Entry:
-    """One array: its shape (MATLAB's axis order where MATLAB wrote it), whether it holds real numbers, its full size in bytes."""
+    """One array: its shape (MATLAB's axis order where MATLAB wrote it), whether it holds real numbers, its
+    full size in bytes.
+    """
 
     shape: tuple[int, ...]
     numeric: bool
@@ -34,7 +37,8 @@ class Entry:
 
 @dataclass(frozen=True)
 class Contents:
-    """The arrays of a file (or of the ``.mat`` files of a folder) by name; fields of a MATLAB struct as ``struct.field``.
+    """The arrays of a file (or of the ``.mat`` files of a folder) by name; fields of a MATLAB struct as
+    ``struct.field``.
 
     Args:
         path: the file or folder.
@@ -156,7 +160,8 @@ class Contents:
 
 
 def open_contents(path: str | Path) -> Contents:
-    """List a file or folder without reading its arrays (but for the structs of old MATLAB files, which have no table).
+    """List a file or folder without reading its arrays (but for the structs of old MATLAB files, which have
+    no table).
 
     Raises:
         CaptureError: nothing there, not readable, damaged, or of no known container.

@@ -1,4 +1,6 @@
-"""Confocal captures of f-k migration (Lindell, Wetzstein, O'Toole, SIGGRAPH 2019): ``meas``, with ``tofgrid`` beside it."""
+"""Confocal captures of f-k migration (Lindell, Wetzstein, O'Toole, SIGGRAPH 2019): ``meas``, with ``tofgrid``
+beside it.
+"""
 
 from __future__ import annotations
 

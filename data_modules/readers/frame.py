@@ -10,7 +10,8 @@ from nlos_lit.capture.errors import CaptureError
 def wall_rotation(normals: np.ndarray) -> np.ndarray:
     """``[3, 3]`` proper rotation that turns the mean wall normal to +z and keeps the file's vertical up.
 
-    The vertical is the file's y, or its z where the wall's normal runs along y. The identity for a normal along +z.
+    The vertical is the file's y, or its z where the wall's normal runs along y. The identity for a normal
+    along +z.
     """
     mean = normals.reshape(-1, 3).astype(np.float64).mean(axis=0)
     length = np.linalg.norm(mean)

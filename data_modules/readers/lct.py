@@ -1,4 +1,6 @@
-"""Confocal captures of the light-cone transform (O'Toole, Lindell, Wetzstein, Nature 2018): ``rect_data``, ``width``."""
+"""Confocal captures of the light-cone transform (O'Toole, Lindell, Wetzstein, Nature 2018): ``rect_data``,
+``width``.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def matches(contents: Contents) -> bool:
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Bin 0 holds the direct pulse's peak, so path zero is its start; spots are the centres of equal cells of the square."""
+    """Bin 0 holds the direct pulse's peak, so path zero is its start; spots are the centres of equal cells of
+    the square.
+    """
     contents = open_contents(path)
     contents.require("rect_data")
     if contents.ndim("rect_data") != 3:

@@ -1,8 +1,9 @@
 """Numeric arrays of MATLAB v5–v7.2 files, and those in their structs.
 
-Written from The MathWorks' "MAT-File Format" document. Only numbers are ever decoded: cells, objects, function handles and text
-are listed and skipped, every length is checked against the bytes there are, and nothing in a file can run code. (General readers
-follow the file's lengths and types unchecked and can crash the interpreter on a damaged file.)
+Written from The MathWorks' "MAT-File Format" document. Only numbers are ever decoded: cells, objects,
+function handles and text are listed and skipped, every length is checked against the bytes there are, and
+nothing in a file can run code. (General readers follow the file's lengths and types unchecked and can crash
+the interpreter on a damaged file.)
 """
 
 from __future__ import annotations

@@ -24,8 +24,9 @@ class ReaderOptions:
         gate: ``(first, last)`` half-open range of bins to fit.
         flip_x, flip_y: mirror the wall coordinate, for a file whose axes run the other way.
         swap_xy: exchange x and y, before any flip.
-        scan_order: order of acquisition over the file's own two scan axes: ``raster`` (last axis fastest), ``serpentine``
-            (the same, every second line backwards), ``columns`` (first axis fastest), or each spot's rank in the file's order.
+        scan_order: order of acquisition over the file's own two scan axes: ``raster`` (last axis fastest),
+            ``serpentine`` (the same, every second line backwards), ``columns`` (first axis fastest), or each
+            spot's rank in the file's order.
         exposure_s: exposure per spot, s.
         raw_scale: whether a y-tal file carries the factor π·cosθ_l/d_l² of an unmodified ``tal render``.
 

@@ -1,4 +1,6 @@
-"""Non-confocal captures of phasor-field imaging (Liu et al., Nature 2019, as prepared for Liu et al., Nat. Commun. 2020)."""
+"""Non-confocal captures of phasor-field imaging (Liu et al., Nature 2019, as prepared for Liu et al., Nat.
+Commun. 2020).
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,11 @@ def matches(contents: Contents) -> bool:
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """The laser scans the grid; the detector looks at grid point ``SPAD_index`` (row, column, counted from 1).
+    """The laser scans the grid; the detector looks at grid point ``SPAD_index`` (row, column, counted from
+    1).
 
-    Times are taken as path from laser to detector point; the public demo adds 0.1 m to the depth term as an electrical delay,
-    which ``t_start = -0.1`` would express.
+    Times are taken as path from laser to detector point; the public demo adds 0.1 m to the depth term as an
+    electrical delay, which ``t_start = -0.1`` would express.
     """
     contents = open_contents(path)
     contents.require("rect_data", "SPAD_index")

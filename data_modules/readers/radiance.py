@@ -1,4 +1,6 @@
-"""Radiance HDR pictures (RGBE): flat and new-style run-length scanlines, as in the Radiance reference manual, 'filefmts'."""
+"""Radiance HDR pictures (RGBE): flat and new-style run-length scanlines, as in the Radiance reference manual,
+'filefmts'.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""MATLAB captures of the CMU group: Ahn et al. (ICCV 2019) ``NLOSDATA``; Tsai et al. (CVPR 2019) ``transient`` + ``lighting``;
-and plain ``meas`` cubes in MATLAB v5 files, which say nothing about their units."""
+"""MATLAB captures of the CMU group: Ahn et al. (ICCV 2019) ``NLOSDATA``; Tsai et al. (CVPR 2019)
+``transient`` + ``lighting``; and plain ``meas`` cubes in MATLAB v5 files, which say nothing about their
+units.
+"""
 
 from __future__ import annotations
 
@@ -44,7 +46,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 
 
 def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
-    """The hidden object is at the file's origin and the wall at z = target_dist: a half turn about y brings it to our frame."""
+    """The hidden object is at the file's origin and the wall at z = target_dist: a half turn about y brings
+    it to our frame.
+    """
     laser, sensor = _points(contents, "NLOSDATA.l"), _points(contents, "NLOSDATA.s")
     distance = (
         contents.scalar("NLOSDATA.target_dist")
@@ -94,7 +98,9 @@ def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capt
 
 
 def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
-    """Confocal points in the wall plane z = 0, x and y as they are; LCT data re-saved in this form have 4 ps bins."""
+    """Confocal points in the wall plane z = 0, x and y as they are; LCT data re-saved in this form have 4 ps
+    bins.
+    """
     _ask(path, options, "bin_width_ps")
     if options.wall_size is not None:
         raise CaptureError(
@@ -122,7 +128,9 @@ def _read_list(path: Path, contents: Contents, options: ReaderOptions) -> Captur
 
 
 def _read_cube(path: Path, contents: Contents, options: ReaderOptions) -> Capture:
-    """Nothing says how the axes of such a cube run: taken as x, then y, both growing; flip_x, flip_y and swap_xy say otherwise."""
+    """Nothing says how the axes of such a cube run: taken as x, then y, both growing; flip_x, flip_y and
+    swap_xy say otherwise.
+    """
     contents.require("meas")
     if contents.ndim("meas") != 3:
         raise CaptureError(

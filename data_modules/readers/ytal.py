@@ -1,4 +1,6 @@
-"""y-tal's HDF5 captures (github.com/diegoroyo/tal), as its documentation and files show them; `ytal_write` writes them."""
+"""y-tal's HDF5 captures (github.com/diegoroyo/tal), as its documentation and files show them; `ytal_write`
+writes them.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +33,9 @@ def matches(contents: Contents) -> bool:
 def read(path: Path, options: ReaderOptions) -> Capture:
     """The file's own coordinates, turned only where its wall does not face +z.
 
-    Where the times include laser → wall and wall → sensor, those ways are taken off each spot by whole bins. Where the values
-    carry tal's raw scale (said by ``raw_scale``, or by a ``scene_info`` that `tal render` wrote), they are divided by
-    π·cosθ_l/d_l², the irradiance of the laser at each wall point.
+    Where the times include laser → wall and wall → sensor, those ways are taken off each spot by whole bins.
+    Where the values carry tal's raw scale (said by ``raw_scale``, or by a ``scene_info`` that `tal render`
+    wrote), they are divided by π·cosθ_l/d_l², the irradiance of the laser at each wall point.
     """
     contents = open_contents(path)
     contents.require("H", "delta_t", "sensor_grid_xyz", "laser_grid_xyz")
@@ -207,7 +209,9 @@ def _device(contents: Contents, name: str) -> np.ndarray | None:
 
 
 def _tal_rendered(text: str) -> bool:
-    """Whether `tal render` wrote this scene_info: top-level keys ``tal_version`` and ``config`` of its YAML, found as text."""
+    """Whether `tal render` wrote this scene_info: top-level keys ``tal_version`` and ``config`` of its YAML,
+    found as text.
+    """
     return all(re.search(rf"^{key}:", text, re.MULTILINE) for key in ("tal_version", "config"))
 
 

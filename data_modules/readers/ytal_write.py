@@ -1,4 +1,6 @@
-"""Write a capture as a y-tal HDF5 file, readable by tal, with this project's further facts inside ``scene_info``."""
+"""Write a capture as a y-tal HDF5 file, readable by tal, with this project's further facts inside
+``scene_info``.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,14 @@ _VALUE_TYPES = {"float16", "float32", "float64"}
 def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> Path:
     """Write ``capture`` so that reading it back gives the same capture.
 
-    H is float32 as tal expects, so whole counts must not exceed 2²⁴ where they are odd. Scans are stored as T_Sx_Sy (confocal
-    and one laser point), T_Lx_Ly_Sx_Sy (exhaustive, and one sensor point as a 1 × 1 sensor grid), T_Li_Si (irregular, every
-    laser with every sensor point) or T_Si (irregular pairs). The file appears under its name only when complete.
+    H is float32 as tal expects, so whole counts must not exceed 2²⁴ where they are odd. Scans are stored as
+    T_Sx_Sy (confocal and one laser point), T_Lx_Ly_Sx_Sy (exhaustive, and one sensor point as a 1 × 1 sensor
+    grid), T_Li_Si (irregular, every laser with every sensor point) or T_Si (irregular pairs). The file
+    appears under its name only when complete.
 
     Raises:
-        CaptureError: the file exists and ``overwrite`` is false, it cannot be written, counts that float32 cannot hold, or
-            provenance that is not JSON.
+        CaptureError: the file exists and ``overwrite`` is false, it cannot be written, counts that float32
+            cannot hold, or provenance that is not JSON.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -71,7 +74,9 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
 
 
 def own_facts(text: str, path: Path) -> dict[str, Any] | None:
-    """The facts that `write_capture` put into ``scene_info``, as `Capture` arguments and ``dtype``; None for any other text."""
+    """The facts that `write_capture` put into ``scene_info``, as `Capture` arguments and ``dtype``; None for
+    any other text.
+    """
     line = (
         next((line for line in text.splitlines() if line.startswith(_OURS)), None) if _OURS in text else None
     )

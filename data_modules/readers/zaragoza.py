@@ -27,9 +27,11 @@ def matches(contents: Contents) -> bool:
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Bounces and colours are summed; the ways laser → wall and wall → camera are taken off each spot by whole bins.
+    """Bounces and colours are summed; the ways laser → wall and wall → camera are taken off each spot by
+    whole bins.
 
-    Axes as h5py shows them: ``data`` [colour, T, bounce, sy, sx(, ly, lx)] with positions [3, y, x], or all in reverse.
+    Axes as h5py shows them: ``data`` [colour, T, bounce, sy, sx(, ly, lx)] with positions [3, y, x], or all
+    in reverse.
     """
     contents = open_contents(path)
     contents.require("data", "deltaT", "cameraGridPositions", "cameraPosition")
@@ -121,7 +123,9 @@ def _grid(contents: Contents, name: str, last: bool) -> np.ndarray:
 def _transients(
     contents: Contents, camera: tuple[int, int], laser: tuple[int, int] | None, last: bool
 ) -> tuple[np.ndarray, int, int]:
-    """``[S, T]`` with spots in the order (laser grid,) camera grid, and how many colours and bounces were summed."""
+    """``[S, T]`` with spots in the order (laser grid,) camera grid, and how many colours and bounces were
+    summed.
+    """
     data = contents.counts("data")
     grids = [*camera, *(laser or ())]
     if not last:

@@ -46,7 +46,8 @@ def simulate_capture(
         progress: show a progress bar when it takes more than a few seconds.
 
     Raises:
-        UserError: nothing of the scene falls into the time window, or a direct pulse is asked of a scan that is not confocal.
+        UserError: nothing of the scene falls into the time window, or a direct pulse is asked of a scan that
+            is not confocal.
     """
     if sensor.direct_counts and scan.kind != "confocal":
         raise UserError("only a confocal scan sees the direct pulse at path 0; set direct_counts to 0")

@@ -18,11 +18,12 @@ class Mesh:
     Args:
         vertices: ``[V, 3]`` positions, m, in the capture's frame (wall near z = 0, scene at z > 0).
         faces: ``[F, 3]`` vertex indices; the outward normal follows the right-hand rule.
-        albedo: ``[V]`` diffuse reflectance in [0, 1], linear across each face. A scalar is spread over all vertices.
-            Sharp steps need their own vertices on each side: see `from_face_albedo`.
+        albedo: ``[V]`` diffuse reflectance in [0, 1], linear across each face. A scalar is spread over all
+            vertices. Sharp steps need their own vertices on each side: see `from_face_albedo`.
 
     Raises:
-        UserError: shapes disagree, coordinates are not finite, a face names a vertex that is not there, albedo outside [0, 1].
+        UserError: shapes disagree, coordinates are not finite, a face names a vertex that is not there,
+            albedo outside [0, 1].
     """
 
     vertices: np.ndarray
@@ -94,7 +95,8 @@ def join(*meshes: Mesh) -> Mesh:
 def load_mesh(path: str | Path, albedo: float = 1.0) -> Mesh:
     """Read an OBJ, PLY, STL, OFF or glTF mesh in metres, in the capture's frame.
 
-    Vertex colours, where the file has them, become the albedo (mean of red, green and blue); otherwise ``albedo`` everywhere.
+    Vertex colours, where the file has them, become the albedo (mean of red, green and blue); otherwise
+    ``albedo`` everywhere.
 
     Raises:
         UserError: the file is missing or holds no triangles.
@@ -115,14 +117,16 @@ def load_mesh(path: str | Path, albedo: float = 1.0) -> Mesh:
 
 
 def subdivide(mesh: Mesh, longest_edge: Callable[[np.ndarray], np.ndarray]) -> Mesh:
-    """Halve faces at their longest edge until none is longer than allowed; area and shape stay exactly the same.
+    """Halve faces at their longest edge until none is longer than allowed; area and shape stay exactly the
+    same.
 
     Args:
         mesh: any mesh; faces without area are dropped.
         longest_edge: allowed edge length ``[F]`` of faces whose centroids ``[F, 3]`` it is given.
 
     Returns:
-        a mesh whose neighbouring faces may meet in the middle of an edge, which a sum over faces does not mind.
+        a mesh whose neighbouring faces may meet in the middle of an edge, which a sum over faces does not
+        mind.
     """
     scale = np.ptp(mesh.vertices, axis=0).max()
     faces = mesh.faces[np.linalg.norm(mesh.face_vectors, axis=1) > 1e-14 * scale**2]

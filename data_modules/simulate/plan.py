@@ -12,7 +12,9 @@ KINDS = ("confocal", "single", "exhaustive")
 
 
 def wall_grid(nx: int, ny: int, width: float, height: float) -> np.ndarray:
-    """``[nx, ny, 3]`` centres of the cells of a wall ``width × height`` m around the origin, in the plane z = 0."""
+    """``[nx, ny, 3]`` centres of the cells of a wall ``width × height`` m around the origin, in the plane z =
+    0.
+    """
     x = width * ((np.arange(nx) + 0.5) / nx - 0.5)
     y = height * ((np.arange(ny) + 0.5) / ny - 0.5)
     return np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((nx, ny))], axis=2)
@@ -23,7 +25,8 @@ class ScanPlan:
     """How a planar wall is scanned and how time is binned.
 
     Args:
-        kind: ``confocal``; ``single`` (one point fixed, the other scans the grid); ``exhaustive`` (every pair of grid points).
+        kind: ``confocal``; ``single`` (one point fixed, the other scans the grid); ``exhaustive`` (every pair
+            of grid points).
         nx, ny: grid points along x and y.
         width: extent of the scanned wall along x, m.
         height: along y; None means ``width``.
@@ -32,7 +35,8 @@ class ScanPlan:
         t_start: path length at the start of bin 0, m.
         fixed: what stands still in a single scan, ``laser`` or ``sensor``.
         fixed_point: (x, y) of it, m.
-        gate: bins that may be fitted, half-open; None means all, or those after the direct pulse where there is one.
+        gate: bins that may be fitted, half-open; None means all, or those after the direct pulse where there
+            is one.
         wall_albedo: reflectance of the wall.
     """
 

@@ -26,7 +26,9 @@ def plate(
     turn_y: float = 0,
     albedo: float = 1,
 ) -> Mesh:
-    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre: ``turn_x``, then ``turn_y``, rad."""
+    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre: ``turn_x``, then
+    ``turn_y``, rad.
+    """
     x, y = width / 2, height / 2
     corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]])
     cx, sx, cy, sy = np.cos(turn_x), np.sin(turn_x), np.cos(turn_y), np.sin(turn_y)
@@ -45,7 +47,9 @@ def sphere(
     opening: float = np.pi,
     albedo: float = 1.0,
 ) -> Mesh:
-    """A sphere of latitude rings about the pole nearest the wall, out to the polar angle ``opening`` (π/2: a dome)."""
+    """A sphere of latitude rings about the pole nearest the wall, out to the polar angle ``opening`` (π/2: a
+    dome).
+    """
     segments = 2 * rings
     polar = np.linspace(0, opening, rings + 1)[:, None]
     around = 2 * np.pi * np.arange(segments) / segments
@@ -106,10 +110,11 @@ def strokes(
 
 
 def default_scene() -> Mesh:
-    """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome (albedo 0.9).
+    """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome
+    (albedo 0.9).
 
-    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome reaches from
-    z = 0.68 to 0.86 m; the F hides it from part of the wall.
+    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome
+    reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
     letter = strokes(

@@ -1,4 +1,6 @@
-"""From expected radiance to photon counts: laser-sensor response, exposure, background and Poisson statistics."""
+"""From expected radiance to photon counts: laser-sensor response, exposure, background and Poisson
+statistics.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ class SensorModel:
         kappa: decay rate of the exponential tail, 1/m of path; infinite for none.
         background: expected counts per bin from ambient light and dark counts.
         mean_counts: third-bounce counts a spot inside the window, averaged over the scan: sets the exposure.
-        direct_counts: counts a spot of the first bounce at path 0, with the same response (confocal scans only).
+        direct_counts: counts a spot of the first bounce at path 0, with the same response (confocal scans
+            only).
 
     Raises:
         UserError: a negative number, or κ or the mean counts are zero.
@@ -52,7 +55,8 @@ class SensorModel:
 def response_cdf(t: np.ndarray, sigma: float, kappa: float) -> np.ndarray:
     """Share of an exponential ⊛ Gaussian that arrives before path ``t``.
 
-    F(t) = Φ(t/σ) - exp(κ²σ²/2 - κt) Φ(t/σ - κσ), written with erfcx where exp and Φ would over- and underflow.
+    F(t) = Φ(t/σ) - exp(κ²σ²/2 - κt) Φ(t/σ - κσ), written with erfcx where exp and Φ would over- and
+    underflow.
     """
     t = np.asarray(t, dtype=np.float64)
     if sigma == 0:
@@ -69,8 +73,8 @@ def response_kernel(sigma: float, kappa: float, bin_length: float) -> tuple[np.n
     """The response integrated over bins, for a photon due at the centre of bin 0.
 
     Returns:
-        kernel ``[K]`` with sum 1, mean 1/κ and variance σ² + 1/κ² + bin²/12 (in path, counted from bin centre 0, for
-        responses wider than a bin), and the bin of its first entry (≤ 0).
+        kernel ``[K]`` with sum 1, mean 1/κ and variance σ² + 1/κ² + bin²/12 (in path, counted from bin centre
+        0, for responses wider than a bin), and the bin of its first entry (≤ 0).
     """
     before, after = SensorModel(sigma, kappa).reach
     first, last = -int(np.ceil(before / bin_length)) - 1, int(np.ceil(after / bin_length)) + 1
@@ -79,7 +83,9 @@ def response_kernel(sigma: float, kappa: float, bin_length: float) -> tuple[np.n
 
 
 def respond(transients: np.ndarray, sensor: SensorModel, bin_length: float) -> np.ndarray:
-    """Transients ``[S, T]`` as the sensor sees them, same bins; each bin's light is taken to arrive at its centre."""
+    """Transients ``[S, T]`` as the sensor sees them, same bins; each bin's light is taken to arrive at its
+    centre.
+    """
     kernel, first = response_kernel(sensor.sigma, sensor.kappa, bin_length)
     seen = np.empty_like(transients)
     for start in range(0, len(transients), SPOT_BLOCK):

@@ -1,13 +1,16 @@
 """Third-bounce transients of a triangle mesh, as expected values.
 
-Radiance leaving the wall at the sensor's point per unit laser power at the laser's point, integrated over each time bin:
+Radiance leaving the wall at the sensor's point per unit laser power at the laser's point, integrated over
+each time bin:
 
-    H = Σ_patches A ρ_w² ρ_p / π³ · cosθ_l cosθ_p1 cosθ_p2 cosθ_s / (d1² d2²) · V(l, p) V(p, s)        at path d1 + d2
+    H = Σ_patches A ρ_w² ρ_p / π³ · cosθ_l cosθ_p1 cosθ_p2 cosθ_s / (d1² d2²) · V(l, p) V(p, s)        at path
+    d1 + d2
 
-(three Lambertian reflections: wall, patch, wall). The mesh is split into patches that are small against their distance and
-over which the path length is linear to a fraction of a bin. Each patch's energy is then spread over its path lengths as a
-linear path length over a triangle spreads it: its density is a triangle from the nearest to the farthest corner with its
-peak at the middle one. So a patch may cover several bins, energy is conserved and bins do not ripple.
+(three Lambertian reflections: wall, patch, wall). The mesh is split into patches that are small against their
+distance and over which the path length is linear to a fraction of a bin. Each patch's energy is then spread
+over its path lengths as a linear path length over a triangle spreads it: its density is a triangle from the
+nearest to the farthest corner with its peak at the middle one. So a patch may cover several bins, energy is
+conserved and bins do not ripple.
 
 Nothing here is shared with the renderer that is fitted to captures.
 """
@@ -34,7 +37,8 @@ LONG_SECONDS = 5.0  # above this a progress bar is shown
 
 @dataclass(frozen=True)
 class Work:
-    """What a simulation costs: ``patches`` after splitting, (spot, patch) ``pairs``, rough ``seconds`` and peak ``bytes``.
+    """What a simulation costs: ``patches`` after splitting, (spot, patch) ``pairs``, rough ``seconds`` and
+    peak ``bytes``.
 
     ``keep_legs``: the legs of all wall points are computed once, because spots share them (exhaustive scans).
     """
@@ -75,7 +79,8 @@ class Patches:
         self.normal = vectors / self.area[:, None]
         self.centroid = split.corners.mean(axis=1)
         self.albedo = split.albedo[split.faces].mean(axis=1)
-        # Rays start off the surface by a little of the patch's own size, but by no less than single precision resolves.
+        # Rays start off the surface by a little of the patch's own size, but by no less than single precision
+        # resolves.
         lift = np.maximum(
             1e-3 * np.sqrt(self.area), 2e-6 * max(self.scale, float(np.abs(mesh.vertices).max()))
         )
@@ -91,8 +96,8 @@ class Patches:
         """One leg of the path: from wall points ``[U, 3]`` with normals ``[U, 3]`` to all patches.
 
         Returns:
-            signed factor cosθ_wall cosθ_patch / d² of every patch ``[U, P]``, 1/m², zero where unlit and negative where the
-            patch is reached from behind; distance to every vertex ``[U, V]``, m.
+            signed factor cosθ_wall cosθ_patch / d² of every patch ``[U, P]``, 1/m², zero where unlit and
+            negative where the patch is reached from behind; distance to every vertex ``[U, V]``, m.
         """
         distance = np.sqrt(_squared_distance(points, self.mesh.vertices))
         at_wall = _dots(normals, self.centroid) - (normals * points).sum(axis=1)[:, None]
@@ -137,7 +142,8 @@ def simulate_transients(
         n_bins: number of bins T.
         t_start: path length at which bin 0 begins, m.
         wall_albedo: reflectance of the wall.
-        two_sided: faces reflect from both sides; otherwise only from the one their normal points to, and the other is black.
+        two_sided: faces reflect from both sides; otherwise only from the one their normal points to, and the
+            other is black.
         occlusion: faces hide what is behind them.
         detail: 2 halves the patches' edges (four times the work).
         progress: show a progress bar when it takes more than a few seconds.
@@ -172,7 +178,9 @@ def simulate_with_rest(
     detail: float = 1.0,
     progress: bool = False,
 ) -> np.ndarray:
-    """As `simulate_transients`, ``[S, T + 2]``: the first and the last column hold what falls before and after the bins."""
+    """As `simulate_transients`, ``[S, T + 2]``: the first and the last column hold what falls before and
+    after the bins.
+    """
     laser, sensor, laser_normal, sensor_normal = (
         np.asarray(a, dtype=np.float64) for a in (laser, sensor, laser_normal, sensor_normal)
     )
@@ -243,7 +251,8 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
         n_bins: number of bins T.
 
     Returns:
-        ``[B, T + 2]``, what falls before bin 0 in column 0 and what falls after the last in the last; rows sum to ``energy``'s.
+        ``[B, T + 2]``, what falls before bin 0 in column 0 and what falls after the last in the last; rows
+        sum to ``energy``'s.
     """
     n_rows, n_vertices = bins.shape
     row, patch = np.nonzero(energy > 0)
@@ -255,7 +264,8 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
     a, b, c = (flat[base + faces[patch, i]] for i in range(3))
     first, last = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     middle = a + b + c - first - last
-    # Everything starts in its first bin; then, at each bin edge it crosses, the part beyond that edge moves one bin on.
+    # Everything starts in its first bin; then, at each bin edge it crosses, the part beyond that edge moves
+    # one bin on.
     start = np.floor(first).astype(np.int64)
     width = n_bins + 2
     shape = n_rows * width

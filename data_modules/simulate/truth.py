@@ -69,7 +69,9 @@ def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool 
 
 
 def save_truth(path: str | Path, truth: Truth) -> None:
-    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and the transients, if any."""
+    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and the
+    transients, if any.
+    """
     with h5py.File(path, "w") as file:
         for name in ("x", "y", "depth", "normal", "albedo", "clean", "expected"):
             values = getattr(truth, name)
@@ -82,7 +84,8 @@ def save_truth(path: str | Path, truth: Truth) -> None:
 
 
 def load_truth(path: str | Path) -> Truth:
-    """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y`` (nothing there: -1 or NaN).
+    """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y`` (nothing there:
+    -1 or NaN).
 
     Raises:
         UserError: no such file, not HDF5, or a key is missing.

@@ -24,7 +24,9 @@ class Occluder:
         )
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """``[N]`` True where something lies between ``start`` and ``end`` ``[N, 3]``; both should be clear of the surface."""
+        """``[N]`` True where something lies between ``start`` and ``end`` ``[N, 3]``; both should be clear of
+        the surface.
+        """
         rays = np.empty((len(start), 6), dtype=np.float32)
         rays[:, :3] = start
         rays[:, 3:] = end - start
@@ -36,8 +38,8 @@ class Occluder:
         """First surface met from ``start`` along ``direction`` ``[N, 3]``.
 
         Returns:
-            distance ``[N]`` in units of ``direction`` (infinite where nothing is met), face index ``[N]`` and barycentric
-            weights ``[N, 3]`` of the face's corners (meaningless where nothing is met).
+            distance ``[N]`` in units of ``direction`` (infinite where nothing is met), face index ``[N]`` and
+            barycentric weights ``[N, 3]`` of the face's corners (meaningless where nothing is met).
         """
         hit = self._scene.cast_rays(
             self._tensor(np.concatenate([start, direction], axis=1).astype(np.float32))

@@ -1,7 +1,8 @@
 """Classical reconstructions in the project's frame, for comparison and quick looks.
 
-Each method is a function of a capture and a volume grid, ``method(capture, grid, **options) -> [nz, nx, ny]`` float32, nonnegative;
-``METHODS`` names them. Equations, options, sources and measured errors: ``docs/baselines.md``.
+Each method is a function of a capture and a volume grid, ``method(capture, grid, **options) -> [nz, nx, ny]``
+float32, nonnegative; ``METHODS`` names them. Equations, options, sources and measured errors:
+``docs/baselines.md``.
 """
 
 from __future__ import annotations
@@ -69,7 +70,9 @@ def reconstruct(
 def reconstruct_directed(
     capture: Capture, grid: VolumeGrid, method: str, *, budget_bytes: int | None = None, **options: Any
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """As :func:`reconstruct`, with the vectors ``[3, nz, nx, ny]`` along the surface's normal of a method in ``FIELDS``."""
+    """As :func:`reconstruct`, with the vectors ``[3, nz, nx, ny]`` along the surface's normal of a method in
+    ``FIELDS``.
+    """
     function = _checked(capture, grid, method, budget_bytes, options)
     if method not in FIELDS:
         return function(capture, grid, **options), None
@@ -93,7 +96,8 @@ def _checked(
 
 
 def estimate_bytes(capture: Capture, grid: VolumeGrid, method: str) -> int:
-    """Bytes that a method will allocate at its peak, beyond the capture's own counts; allocates nothing of that size.
+    """Bytes that a method will allocate at its peak, beyond the capture's own counts; allocates nothing of
+    that size.
 
     Raises:
         UserError: unknown method.

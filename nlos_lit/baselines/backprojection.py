@@ -1,7 +1,8 @@
 """Backprojection and filtered backprojection: any wall, any spots, any pairing of laser and sensor.
 
-Velten et al., Nature Communications 3, 745 (2012): every voxel collects, from every spot's transient, the bin whose ellipsoid of
-equal path runs through it; a Laplacian then removes the blur that the overlap of the ellipsoids leaves.
+Velten et al., Nature Communications 3, 745 (2012): every voxel collects, from every spot's transient, the bin
+whose ellipsoid of equal path runs through it; a Laplacian then removes the blur that the overlap of the
+ellipsoids leaves.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ _TABLE = 1 << 22  # distances from wall points to voxels kept at a time
 
 
 def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Tensor:
-    """Backprojection ``I(v) = Σ_s H_s(|v - l_s| + |v - d_s|)``, linear between bin centres, zero outside the gate.
+    """Backprojection ``I(v) = Σ_s H_s(|v - l_s| + |v - d_s|)``, linear between bin centres, zero outside the
+    gate.
 
     Args:
         capture: of any kind; the spots need no order and no plane.
@@ -82,7 +84,8 @@ def fbp(
     Args:
         capture: of any kind.
         grid: where to reconstruct.
-        filter: ``log``, Laplacian of Gaussian over the three axes, or ``second_derivative``, of a Gaussian along z alone.
+        filter: ``log``, Laplacian of Gaussian over the three axes, or ``second_derivative``, of a Gaussian
+            along z alone.
         sigma: standard deviation of the Gaussian in voxels (derivatives are per voxel as well).
         falloff: as for :func:`bp`.
 
@@ -128,7 +131,9 @@ def fbp_bytes(capture: Capture, grid: VolumeGrid) -> int:
 
 @dataclass(frozen=True)
 class _PathEnd:
-    """Distinct wall points at one end of the paths, which of them each spot uses, and how often the path runs to them."""
+    """Distinct wall points at one end of the paths, which of them each spot uses, and how often the path runs
+    to them.
+    """
 
     points: np.ndarray
     of_spot: torch.Tensor
@@ -161,7 +166,9 @@ def _squared_distances(points: np.ndarray, centres: np.ndarray, scale: float) ->
 
 
 def _along(volume: torch.Tensor, axis: int, sigma: float, *, derivative: bool) -> torch.Tensor:
-    """The volume convolved along one axis with a Gaussian or its second derivative; edge values continue outside."""
+    """The volume convolved along one axis with a Gaussian or its second derivative; edge values continue
+    outside.
+    """
     radius = int(np.ceil(4 * sigma))
     t = np.arange(-radius, radius + 1)
     kernel = np.exp(-0.5 * (t / sigma) ** 2)

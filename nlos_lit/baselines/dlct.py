@@ -1,17 +1,21 @@
-"""Directional light-cone transform: albedo and surface normal of every voxel by one three-dimensional deconvolution.
+"""Directional light-cone transform: albedo and surface normal of every voxel by one three-dimensional
+deconvolution.
 
-Young, Lindell, Girod, Taubman, Wetzstein, *Non-line-of-sight surface reconstruction using the directional light-cone transform*,
-CVPR 2020. A surface element of albedo ρ and normal n sends light along ω, from it to the wall, as ``ρ n·ω``: linear in
-``q = ρ n``. With ``v = (path/2)²``, ``u = z²`` and ``ω = (x' - x, y' - y, -z)/r`` the light-cone transform takes three channels,
+Young, Lindell, Girod, Taubman, Wetzstein, *Non-line-of-sight surface reconstruction using the directional
+light-cone transform*, CVPR 2020. A surface element of albedo ρ and normal n sends light along ω, from it to
+the wall, as ``ρ n·ω``: linear in ``q = ρ n``. With ``v = (path/2)²``, ``u = z²`` and ``ω = (x' - x, y' - y,
+-z)/r`` the light-cone transform takes three channels,
 
     v^(p/2)·τ(x', y', 2√v) = (x h) ⊛ R_x + (y h) ⊛ R_y + h ⊛ R_z,    h = δ(x² + y² + u - v),
     R_x = q_x/(2√u),    R_y = q_y/(2√u),    R_z = -q_z/2.
 
 One measurement and three unknowns a frequency: the Tikhonov solution is a Wiener filter for each,
 
-    S_i = ĥ_i* g / (Σ_j |ĥ_j|² + Σ_j ‖h_j‖²/snr),    ĥ_j = transforms of (x h/z₀, y h/z₀, h),    S = (z₀ R_x, z₀ R_y, R_z),
+    S_i = ĥ_i* g / (Σ_j |ĥ_j|² + Σ_j ‖h_j‖²/snr),    ĥ_j = transforms of (x h/z₀, y h/z₀, h),    S = (z₀ R_x,
+    z₀ R_y, R_z),
 
-where z₀, the volume's middle depth, makes equal penalties on the three of equal penalties on the components of q.
+where z₀, the volume's middle depth, makes equal penalties on the three of equal penalties on the components
+of q.
 """
 
 from __future__ import annotations
@@ -36,7 +40,8 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 
 
 def dlct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:
-    """Albedo density ``|q|`` of :func:`dlct_field`, zero where the recovered surface faces away from the wall.
+    """Albedo density ``|q|`` of :func:`dlct_field`, zero where the recovered surface faces away from the
+    wall.
 
     Args, errors: of :func:`dlct_field`.
 
@@ -47,7 +52,9 @@ def dlct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float
 
 
 def directed_volume(field: torch.Tensor) -> torch.Tensor:
-    """``[nz, nx, ny]`` length of the vectors of ``field`` ``[3, nz, nx, ny]`` that point to the wall (z < 0), zero elsewhere."""
+    """``[nz, nx, ny]`` length of the vectors of ``field`` ``[3, nz, nx, ny]`` that point to the wall (z < 0),
+    zero elsewhere.
+    """
     return field.norm(dim=0).mul_(field[2] < 0)
 
 
@@ -58,10 +65,12 @@ def dlct_field(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff:
         capture: confocal, on a regular planar lattice.
         grid: where to reconstruct; zero outside the scanned rectangle and outside the depths of the gate.
         snr: as of ``lct``.
-        falloff: how counts of a surface that faces the spot fall with distance: 4 for diffuse, 2 for retroreflective surfaces.
+        falloff: how counts of a surface that faces the spot fall with distance: 4 for diffuse, 2 for
+            retroreflective surfaces.
 
     Returns:
-        ``[3, nz, nx, ny]`` float32, components along x, y and z; a surface that faces the wall has a negative third.
+        ``[3, nz, nx, ny]`` float32, components along x, y and z; a surface that faces the wall has a negative
+        third.
 
     Raises:
         UserError: ``snr`` is not positive.

@@ -1,7 +1,8 @@
 """Light-cone transform: confocal imaging as one three-dimensional deconvolution.
 
-O'Toole, Lindell, Wetzstein, *Confocal non-line-of-sight imaging based on the light-cone transform*, Nature 555, 338 (2018). With
-``v = (path/2)²`` and ``u = z²`` a confocal transient of falloff ``r^-p`` becomes shift-invariant,
+O'Toole, Lindell, Wetzstein, *Confocal non-line-of-sight imaging based on the light-cone transform*, Nature
+555, 338 (2018). With ``v = (path/2)²`` and ``u = z²`` a confocal transient of falloff ``r^-p`` becomes
+shift-invariant,
 
     v^((p-1)/2)·τ(x', y', 2√v) = ∭ ρ(x, y, √u)/(2√u) · δ((x'-x)² + (y'-y)² + u - v) dx dy du,
 
@@ -30,8 +31,8 @@ def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float 
     Args:
         capture: confocal, on a regular planar lattice.
         grid: where to reconstruct; zero outside the scanned rectangle and outside the depths of the gate.
-        snr: power of the signal over that of the noise, relative to the mean power of the kernel's spectrum: large is sharp
-            and noisy, small tends to backprojection.
+        snr: power of the signal over that of the noise, relative to the mean power of the kernel's spectrum:
+            large is sharp and noisy, small tends to backprojection.
         falloff: how counts fall with distance: 4 for diffuse, 2 for retroreflective surfaces.
 
     Returns:
@@ -51,7 +52,9 @@ def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float 
 
 
 class Cone(NamedTuple):
-    """Confocal transients over ``v``: ``values [M, nx, ny]``, cell ``k`` covering ``[first + k·step, first + (k+1)·step)`` m²."""
+    """Confocal transients over ``v``: ``values [M, nx, ny]``, cell ``k`` covering ``[first + k·step, first +
+    (k+1)·step)`` m².
+    """
 
     values: torch.Tensor
     lattice: Lattice
@@ -85,7 +88,8 @@ def lateral_weights(lattice: Lattice, grid: VolumeGrid) -> tuple[torch.Tensor, t
 
 
 def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr: float) -> torch.Tensor:
-    """Solves ``cone = k ⊛ x`` for ``x``: minimises ``‖k ⊛ x - cone‖² + ‖k‖²/snr·‖x‖²`` on a domain padded to twice the size.
+    """Solves ``cone = k ⊛ x`` for ``x``: minimises ``‖k ⊛ x - cone‖² + ‖k‖²/snr·‖x‖²`` on a domain padded to
+    twice the size.
 
     Args:
         cone: ``[M, nx, ny]`` samples in ``v``, zero where padded.
@@ -117,8 +121,9 @@ def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
 def cone_bytes(
     capture: Capture, grid: VolumeGrid, method: str, *, padded_arrays: int, volumes: int, matrices: int
 ) -> int:
-    """Bytes of a light-cone method: three copies of the transients, and at once so many arrays of the transform's size, volumes,
-    and matrices from the cone to depths; ``method`` is named in messages."""
+    """Bytes of a light-cone method: three copies of the transients, and at once so many arrays of the
+    transform's size, volumes, and matrices from the cone to depths; ``method`` is named in messages.
+    """
     bins = gated_bins(capture, grid)
     m, nx, ny = padded((bins, *confocal_lattice(capture, method).shape))
     transform, resampling = m * nx * (ny + 2), bins * grid.shape[0]
@@ -131,7 +136,9 @@ def cone_bytes(
 
 
 def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
-    """How many bins of the gate :func:`lct` and f-k migration work on: those that light from the volume can reach."""
+    """How many bins of the gate :func:`lct` and f-k migration work on: those that light from the volume can
+    reach.
+    """
     longest = path_range(capture, grid)[1]
     return (
         min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1)
@@ -147,7 +154,9 @@ def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
 def cone_kernel(
     shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float
 ) -> torch.Tensor:
-    """``δ(x² + y² - w)`` on the lattice: at each lateral offset one lattice cell's area, shared by the two nearest ``w``."""
+    """``δ(x² + y² - w)`` on the lattice: at each lateral offset one lattice cell's area, shared by the two
+    nearest ``w``.
+    """
     bins, nx, ny = shape
     x, y = np.meshgrid(np.arange(1 - nx, nx), np.arange(1 - ny, ny), indexing="ij")
     w = ((x * pitch[0]) ** 2 + (y * pitch[1]) ** 2) / step
@@ -160,7 +169,9 @@ def cone_kernel(
 
 
 def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tensor:
-    """Sparse ``[M, T]``: counts in bins with ``edges`` in ``v`` to ``v^(p/2)`` times counts per unit ``v`` in equal cells."""
+    """Sparse ``[M, T]``: counts in bins with ``edges`` in ``v`` to ``v^(p/2)`` times counts per unit ``v`` in
+    equal cells.
+    """
     bins = len(edges) - 1
     cells = edges[0] + step * np.arange(bins + 1)
     cuts = np.unique(np.concatenate([edges, np.clip(cells, edges[0], edges[-1])]))
@@ -175,7 +186,8 @@ def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tenso
 
 
 def cone_to_depth(cone: Cone, depth: np.ndarray, width: float, power: int = 1) -> torch.Tensor:
-    """Matrix ``[nz, M]``: ``2 z^power·R(z²)``, linear in ``u`` between cell centres, averaged over each voxel's depth.
+    """Matrix ``[nz, M]``: ``2 z^power·R(z²)``, linear in ``u`` between cell centres, averaged over each
+    voxel's depth.
 
     With ``power`` 1 this is the density in z, ``ρ(z) = 2z·R(z²)``.
     """

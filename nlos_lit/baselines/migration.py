@@ -1,8 +1,9 @@
 """f-k migration: confocal transients as a wave field, carried back to the moment of its emission.
 
-Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, ACM Trans. Graph. 38, 116 (2019),
-after Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources that explode at ζ = 0 has unit speed; the spectrum
-``Φ(kx, ky, f)`` of what the wall receives, ``Ψ(x, y, 0, ζ)``, gives the field at ζ = 0:
+Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, ACM Trans.
+Graph. 38, 116 (2019), after Stolt, Geophysics 43, 23 (1978). With ``ζ = path/2`` the field of sources that
+explode at ζ = 0 has unit speed; the spectrum ``Φ(kx, ky, f)`` of what the wall receives, ``Ψ(x, y, 0, ζ)``,
+gives the field at ζ = 0:
 
     Ψ(x, y, z, 0) = ∭ kz/f · Φ(kx, ky, f) e^{i(kx x + ky y + kz z)} dkx dky dkz,      f = √(kx² + ky² + kz²).
 """
@@ -57,8 +58,9 @@ def fk(capture: Capture, grid: VolumeGrid, *, falloff: float = 4.0) -> torch.Ten
 def stolt(field: torch.Tensor, pitch: tuple[float, float], step: float, first: float) -> torch.Tensor:
     """The field at ζ = 0 from the field at the wall, by Stolt's change of variable.
 
-    Interpolation in ``f`` by cubic B-splines multiplies the record by sinc⁴ of ζ over the padded length; with ζ counted from the
-    middle of the record and the record divided by that sinc⁴ beforehand, it is accurate at every depth.
+    Interpolation in ``f`` by cubic B-splines multiplies the record by sinc⁴ of ζ over the padded length; with
+    ζ counted from the middle of the record and the record divided by that sinc⁴ beforehand, it is accurate at
+    every depth.
 
     Args:
         field: ``[N, nx, ny]`` real samples at ``ζ = first + k·step``.

@@ -1,4 +1,6 @@
-"""Linear resampling of a volume from the lattice a method works on to the grid that was asked for, one axis at a time."""
+"""Linear resampling of a volume from the lattice a method works on to the grid that was asked for, one axis
+at a time.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +9,12 @@ import torch
 
 
 def linear_weights(start: float, pitch: float, count: int, centres: np.ndarray, width: float) -> torch.Tensor:
-    """Matrix ``[len(centres), count]`` that interpolates samples at ``start + k·pitch`` linearly and averages over voxels.
+    """Matrix ``[len(centres), count]`` that interpolates samples at ``start + k·pitch`` linearly and averages
+    over voxels.
 
-    A voxel narrower than the sample pitch takes the interpolated value at its centre; a wider one takes the mean over
-    ``width``, so that no sample is skipped. Voxels whose centre lies more than half a pitch outside the samples get zero.
-    Where the two lattices coincide the matrix is the identity.
+    A voxel narrower than the sample pitch takes the interpolated value at its centre; a wider one takes the
+    mean over ``width``, so that no sample is skipped. Voxels whose centre lies more than half a pitch outside
+    the samples get zero. Where the two lattices coincide the matrix is the identity.
     """
     parts = max(1, int(np.ceil(abs(width) / pitch - 1e-6)))
     offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * abs(width)

@@ -1,4 +1,6 @@
-"""Plain phasor-field imaging with the default virtual illumination of Liu et al. 2020: no parameter is fitted."""
+"""Plain phasor-field imaging with the default virtual illumination of Liu et al. 2020: no parameter is
+fitted.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ def rsd(
     """Intensity ``z^q |u|^p``, unit maximum, for a virtual pulse of ``cycles`` wavelengths.
 
     Args:
-        wavelength: λ, m; None takes four spot spacings, as Liu et al. (Nature Communications 2020) recommend at least two.
+        wavelength: λ, m; None takes four spot spacings, as Liu et al. (Nature Communications 2020) recommend
+            at least two.
         cycles: σ_pf = cycles·λ/6, so that ±3 σ hold that many wavelengths.
         power: p of the intensity; the paper's Eq. 2 has 2.
         depth_exponent: q.

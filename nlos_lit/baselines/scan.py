@@ -1,4 +1,6 @@
-"""What the classical methods need to know of a scan: its lattice, the paths that reach a volume, the gated bins."""
+"""What the classical methods need to know of a scan: its lattice, the paths that reach a volume, the gated
+bins.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from nlos_lit.capture.errors import CaptureError
 
 
 def confocal_lattice(capture: Capture, method: str) -> Lattice:
-    """The scan lattice of a confocal capture, for a ``method`` (its name, for the message) that works on nothing else.
+    """The scan lattice of a confocal capture, for a ``method`` (its name, for the message) that works on
+    nothing else.
 
     Raises:
         CaptureError: the capture is not confocal, or its spots are not a regular planar grid.
@@ -30,8 +33,8 @@ def gated_transients(capture: Capture, longest: float, falloff: float) -> tuple[
     """The bins inside the gate, up to path ``longest`` (m), times ``(path/2)^falloff``.
 
     Returns:
-        ``[S, T']`` float32 and the path at the start of its first bin, m. Bins that begin at a negative path are left out: no
-        light from the hidden scene can be in them.
+        ``[S, T']`` float32 and the path at the start of its first bin, m. Bins that begin at a negative path
+        are left out: no light from the hidden scene can be in them.
     """
     step, t_start = capture.bin_length, capture.t_start
     first = max(capture.gate[0], int(np.ceil(-t_start / step - 1e-9)))

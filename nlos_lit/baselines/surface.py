@@ -25,13 +25,13 @@ def front_points(
     Args:
         volume: ``[nz, nx, ny]``.
         threshold: share of the volume's maximum.
-        field: ``[3, nz, nx, ny]`` vectors along the surface's normal, where the method gives them; None takes normals from the
-            depths of neighbouring columns …
+        field: ``[3, nz, nx, ny]`` vectors along the surface's normal, where the method gives them; None takes
+            normals from the depths of neighbouring columns …
         smooth: … after a Gaussian of this many columns.
 
     Returns:
-        Points with the volume's value, relative to its maximum, as albedo and intensity. The depth is the vertex of the parabola
-        through the largest value and its two neighbours.
+        Points with the volume's value, relative to its maximum, as albedo and intensity. The depth is the
+        vertex of the parabola through the largest value and its two neighbours.
     """
     peak = float(volume.max())
     if not peak > 0:
@@ -53,7 +53,9 @@ def front_points(
 
 
 def _vertex(volume: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Where between -½ and ½ planes the parabola through a maximum and its neighbours is largest; 0 at the ends."""
+    """Where between -½ and ½ planes the parabola through a maximum and its neighbours is largest; 0 at the
+    ends.
+    """
     last = len(volume) - 1
     if last < 2:
         return np.zeros(best.shape)
@@ -69,7 +71,9 @@ def _vertex(volume: np.ndarray, best: np.ndarray) -> np.ndarray:
 def _normals_of_depth(
     depth: np.ndarray, seen: np.ndarray, pitch: tuple[float, float, float], smooth: float
 ) -> np.ndarray:
-    """``[3, nx, ny]`` (∂z/∂x, ∂z/∂y, -1) of the smoothed depths of seen columns; towards the wall where a column stands alone."""
+    """``[3, nx, ny]`` (∂z/∂x, ∂z/∂y, -1) of the smoothed depths of seen columns; towards the wall where a
+    column stands alone.
+    """
     weight = gaussian_filter(seen.astype(np.float64), smooth) if smooth else seen.astype(np.float64)
     blurred = gaussian_filter(np.where(seen, depth, 0), smooth) if smooth else np.where(seen, depth, 0)
     surface = np.where(seen, blurred / np.maximum(weight, 1e-12), np.nan)
@@ -78,7 +82,9 @@ def _normals_of_depth(
 
 
 def _slope(surface: np.ndarray, axis: int, pitch: float) -> np.ndarray:
-    """Mean of the differences to the neighbours on either side that belong to the same surface; 0 where there is none."""
+    """Mean of the differences to the neighbours on either side that belong to the same surface; 0 where there
+    is none.
+    """
     step = np.diff(surface, axis=axis) / pitch
     step = np.where(np.abs(step) < STEEPEST, step, np.nan)
     edge = np.full_like(np.take(surface, [0], axis), np.nan)

@@ -15,7 +15,8 @@ _TOLERANCE = 0.01  # how far a spot may lie from its lattice point, in lattice p
 
 @dataclass(frozen=True)
 class Lattice:
-    """Wall points on a regular planar grid: ``x_i = origin[0] + i·pitch[0]``, ``y_j = origin[1] + j·pitch[1]``, ascending.
+    """Wall points on a regular planar grid: ``x_i = origin[0] + i·pitch[0]``, ``y_j = origin[1] +
+    j·pitch[1]``, ascending.
 
     Args:
         origin: ``(x, y, z)`` of lattice point ``(0, 0)``, m.

@@ -1,7 +1,8 @@
 """What was measured, and where: raw photon histograms with the geometry of the scan.
 
-World frame: relay wall near z = 0, hidden scene at z > 0, right-handed, metres. Time is optical path length in metres
-from the laser's wall point to the sensor's wall point; bin ``k`` covers ``[t_start + k·bin_length, t_start + (k+1)·bin_length)``.
+World frame: relay wall near z = 0, hidden scene at z > 0, right-handed, metres. Time is optical path length
+in metres from the laser's wall point to the sensor's wall point; bin ``k`` covers ``[t_start + k·bin_length,
+t_start + (k+1)·bin_length)``.
 """
 
 from __future__ import annotations
@@ -22,23 +23,29 @@ class Capture:
     """Raw transients and the geometry of the scan they were taken with.
 
     Args:
-        counts: ``[S, T]`` photon counts as in the file (any unsigned or float dtype), never scaled, never zeroed.
+        counts: ``[S, T]`` photon counts as in the file (any unsigned or float dtype), never scaled, never
+            zeroed.
         laser: ``[S, 3]`` illuminated wall points, m.
         sensor: ``[S, 3]`` observed wall points, m; equal to ``laser`` when confocal.
         laser_normal: ``[S, 3]`` unit wall normals at ``laser``, towards the hidden scene.
         sensor_normal: ``[S, 3]`` unit wall normals at ``sensor``.
         bin_length: optical path length of one time bin, m (speed of light times bin width).
         t_start: path length at the start of bin 0, m.
-        gate: ``(first, last)`` half-open range of bins that may be fitted (third bounce); None means all bins.
+        gate: ``(first, last)`` half-open range of bins that may be fitted (third bounce); None means all
+            bins.
         scan_shape: ``(nx, ny)`` for one scanned grid, spot ``s = i·ny + j`` at ``x_i, y_j``;
             ``(lx, ly, sx, sy)`` for an exhaustive scan; None for irregular spots.
-        scan_order: ``[S]`` rank of each spot in the order of acquisition; None means row-major raster, i.e. ``arange(S)``.
+        scan_order: ``[S]`` rank of each spot in the order of acquisition; None means row-major raster, i.e.
+            ``arange(S)``.
         exposure_s: exposure per spot in seconds, where known.
-        is_counts: False for expected values without photon statistics (renders); Poisson statements need True.
-        provenance: where the data came from and what was done to it, JSON-serialisable; ``steps`` lists the changes.
+        is_counts: False for expected values without photon statistics (renders); Poisson statements need
+            True.
+        provenance: where the data came from and what was done to it, JSON-serialisable; ``steps`` lists the
+            changes.
 
     Raises:
-        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, or the gate is empty.
+        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, or the gate
+            is empty.
     """
 
     counts: np.ndarray
@@ -161,7 +168,9 @@ class Capture:
         return self._changed(step, counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
 
     def sum_spots(self, factor: int) -> Capture:
-        """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one at their mean position."""
+        """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one at their mean
+        position.
+        """
         if factor == 1:
             return self
         if self.scan_shape is None or len(self.scan_shape) != 2:

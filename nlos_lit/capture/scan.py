@@ -16,8 +16,8 @@ class Scan:
     """Coordinates of all spots, scaled so that effects need no units of their own.
 
     Args:
-        places: one ``[S, 2]`` for each wall point that varies (the spot of a confocal or single scan; laser and sensor else),
-            lateral coordinates from -1 to 1 over the scanned wall.
+        places: one ``[S, 2]`` for each wall point that varies (the spot of a confocal or single scan; laser
+            and sensor else), lateral coordinates from -1 to 1 over the scanned wall.
         half: half the scanned wall's larger side, m: ``places`` × half is metres.
         rank: ``[S]`` place in the order of acquisition, from -1 (first) to 1 (last).
         laser, sensor: ``[S, 3]`` wall points, m.

@@ -15,7 +15,8 @@ class SurfaceTruth:
         x: ``[nx]`` evenly spaced, increasing, m.
         y: ``[ny]``.
         depth: ``[nx, ny]`` z of the surface, m; NaN where there is none.
-        normals: ``[nx, ny, 3]`` unit vectors towards the wall's side, where known; ignored where depth is NaN.
+        normals: ``[nx, ny, 3]`` unit vectors towards the wall's side, where known; ignored where depth is
+            NaN.
         albedo: ``[nx, ny]``, where known.
 
     Raises:

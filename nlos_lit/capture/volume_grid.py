@@ -14,7 +14,8 @@ from nlos_lit.capture.errors import CaptureError, UserError
 
 @dataclass(frozen=True)
 class VolumeGrid:
-    """A regular grid of voxel centres; volumes on it are tensors ``[nz, nx, ny]``, slice by slice like the scan.
+    """A regular grid of voxel centres; volumes on it are tensors ``[nz, nx, ny]``, slice by slice like the
+    scan.
 
     Args:
         origin: ``(x, y, z)`` of the centre of voxel ``[0, 0, 0]``, m.
@@ -52,11 +53,13 @@ def volume_grid(
     refine: int = 1,
     lateral: tuple[int, int] | None = None,
 ) -> VolumeGrid:
-    """The voxels to image: laterally the scan's lattice (refined and extended on request), in depth ``depth`` metres.
+    """The voxels to image: laterally the scan's lattice (refined and extended on request), in depth ``depth``
+    metres.
 
     Args:
         depth: nearest and farthest voxel plane, m from the wall.
-        depth_pitch: spacing of planes, m; None takes half a bin length, which is one bin of path there and back.
+        depth_pitch: spacing of planes, m; None takes half a bin length, which is one bin of path there and
+            back.
         refine: voxels per lattice step.
         lateral: numbers of voxels along x and y, centred on the scan; None covers the scan.
 
@@ -96,7 +99,8 @@ def volume_grid(
 
 
 def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
-    """Shortest and longest optical path, m, from laser through any voxel centre to sensor (bounds over the box).
+    """Shortest and longest optical path, m, from laser through any voxel centre to sensor (bounds over the
+    box).
 
     Raises:
         CaptureError: no such path falls inside the capture's gate, so nothing of the volume was measured.

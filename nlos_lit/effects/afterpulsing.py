@@ -13,16 +13,18 @@ from nlos_lit.functional.delays import convolve, geometric
 class Afterpulsing(Effect):
     """Carriers trapped during an avalanche are released later and count again.
 
-    ``m'_t = m_t + probability · Σ_{s<t} m_s p_{t-s}``, ``p_k ∝ e^{-k/τ}``, ``Σ_k p_k = 1``; only counts of this record matter.
+    ``m'_t = m_t + probability · Σ_{s<t} m_s p_{t-s}``, ``p_k ∝ e^{-k/τ}``, ``Σ_k p_k = 1``; only counts of
+    this record matter.
 
     Parameters: ``probability`` (1), null 0. ``decay`` τ (m of path), scanned.
 
-    Signature: excess behind every strong return, as with ``irf_tail``, and energy is gained; the background rises along the record.
+    Signature: excess behind every strong return, as with ``irf_tail``, and energy is gained; the background
+    rises along the record.
 
     Degenerate with: ``irf_tail`` (the same decay, but energy is kept and the background stays flat).
 
-    Source: S. Cova, A. Lacaita, G. Ripamonti, *Trapping phenomena in avalanche photodiodes on nanosecond scale*, IEEE Electron
-    Device Lett. 12, 1991.
+    Source: S. Cova, A. Lacaita, G. Ripamonti, *Trapping phenomena in avalanche photodiodes on nanosecond
+    scale*, IEEE Electron Device Lett. 12, 1991.
     """
 
     name = "afterpulsing"

@@ -13,14 +13,16 @@ from nlos_lit.effects.smooth import SmoothEffect, over_wall
 class AmbientMap(SmoothEffect):
     """The constant background varies smoothly over the wall, as with a lamp on one side.
 
-    ``background → background · e^{f(x, y)}``, f a 5×5 tensor product of cubic splines without its constant; of both points,
-    added, where both laser and sensor move.
+    ``background → background · e^{f(x, y)}``, f a 5×5 tensor product of cubic splines without its constant;
+    of both points, added, where both laser and sensor move.
 
-    Parameters: ``level_map`` (1, logarithm), at most 24 coefficients, null 0. Quantity ``rms`` (1) of the logarithm.
+    Parameters: ``level_map`` (1, logarithm), at most 24 coefficients, null 0. Quantity ``rms`` (1) of the
+    logarithm.
 
     Signature: the level before the first return forms a smooth map over the wall.
 
-    Degenerate with: nothing where the gate holds bins without scene; else ``irf_tail`` with ``wall_reflectance``.
+    Degenerate with: nothing where the gate holds bins without scene; else ``irf_tail`` with
+    ``wall_reflectance``.
 
     Source: splines: C. de Boor, *A Practical Guide to Splines*, 1978.
     """

@@ -12,13 +12,15 @@ from nlos_lit.effects.effect import Effect, Parameter
 class BackgroundSlope(Effect):
     """The background rises or falls along time, the same way at every spot.
 
-    ``background → background · (1 + slope τ)``, τ from -1 at the start of the gate to 1 at its end; constant before the gate.
+    ``background → background · (1 + slope τ)``, τ from -1 at the start of the gate to 1 at its end; constant
+    before the gate.
 
     Parameters: ``slope`` (1), null 0, at most 0.95 either way.
 
     Signature: residual that is linear in time at bins without scene.
 
-    Degenerate with: ``direct_leak`` and ``irf_tail`` with long decays, ``pile_up`` (which bends the background down).
+    Degenerate with: ``direct_leak`` and ``irf_tail`` with long decays, ``pile_up`` (which bends the
+    background down).
 
     Source: none needed, first order in time.
     """

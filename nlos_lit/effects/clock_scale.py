@@ -16,11 +16,13 @@ class ClockScale(Effect):
 
     Parameters: ``scale`` (1), null 0.
 
-    Signature: early returns too early and late ones too late, or the reverse, the more so the farther from the gate's middle.
+    Signature: early returns too early and late ones too late, or the reverse, the more so the farther from
+    the gate's middle.
 
     Degenerate with: the scene's depth and curvature, ``time_offset``; a deep scene splits them.
 
-    Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (calibration of the time axis).
+    Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (calibration of the
+    time axis).
     """
 
     name = "clock_scale"

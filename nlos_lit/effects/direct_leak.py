@@ -13,16 +13,19 @@ from nlos_lit.functional.delays import geometric
 class DirectLeak(Effect):
     """The tail of the first bounce reaches into the gate, the same at every spot.
 
-    ``background → background + amplitude e^{-(t - first)/τ}``, t the bin number, first that of the gate; constant before the gate.
+    ``background → background + amplitude e^{-(t - first)/τ}``, t the bin number, first that of the gate;
+    constant before the gate.
 
     Parameters: ``amplitude`` (counts/bin, in the gate's first bin), null 0. ``decay`` τ (m of path), scanned.
 
-    Signature: residual above 0 at the start of the gate, equal at all spots however far the scene is from them.
+    Signature: residual above 0 at the start of the gate, equal at all spots however far the scene is from
+    them.
 
-    Degenerate with: ``background_slope`` for long decays, ``gate_edges`` (which is proportional to what is there).
+    Degenerate with: ``background_slope`` for long decays, ``gate_edges`` (which is proportional to what is
+    there).
 
-    Source: gating against the direct pulse: M. Buttafava et al., *Non-line-of-sight imaging using a time-gated single photon
-    avalanche diode*, Opt. Express 23, 2015.
+    Source: gating against the direct pulse: M. Buttafava et al., *Non-line-of-sight imaging using a
+    time-gated single photon avalanche diode*, Opt. Express 23, 2015.
     """
 
     name = "direct_leak"

@@ -1,4 +1,6 @@
-"""What every effect is: a module with declared parameters that acts at one or more stages of the forward model."""
+"""What every effect is: a module with declared parameters that acts at one or more stages of the forward
+model.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,15 @@ class Parameter:
 
     Args:
         unit: SI unit, ``1`` for pure numbers.
-        null: value at which the effect is absent; None for a shape (a delay, a decay) that means nothing at the null …
+        null: value at which the effect is absent; None for a shape (a delay, a decay) that means nothing at
+            the null …
         grid: … and is therefore scanned over these values.
         scale: a noticeable change: stored values count in it.
         lower, upper: bounds.
         size: number of coefficients; they share null, scale and bounds.
         log: shape that is stored as its logarithm (``scale`` is then a change of the logarithm).
-        prior: standard deviation of each coefficient around the null, in its unit, for those that spots alone may not settle.
+        prior: standard deviation of each coefficient around the null, in its unit, for those that spots alone
+            may not settle.
     """
 
     name: str
@@ -43,7 +47,9 @@ class Parameter:
 
 
 class Quantity(NamedTuple):
-    """A number worth reporting, differentiable by the effect's parameters; ``spots``: it counts spots of the scan."""
+    """A number worth reporting, differentiable by the effect's parameters; ``spots``: it counts spots of the
+    scan.
+    """
 
     value: Tensor
     unit: str
@@ -51,14 +57,17 @@ class Quantity(NamedTuple):
 
 
 class Effect(nn.Module, Hooks):
-    """One physical effect. Subclasses set ``name`` and ``stage``, declare parameters, and override the hooks they need.
+    """One physical effect. Subclasses set ``name`` and ``stage``, declare parameters, and override the hooks
+    they need.
 
     Args:
         scan: of the capture.
 
     Attributes:
-        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole transients.
-        per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is what is reported.
+        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
+            transients.
+        per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is
+            what is reported.
     """
 
     name: ClassVar[str]
@@ -114,7 +123,9 @@ class Effect(nn.Module, Hooks):
             self.set(p.name, self.value(p.name))
 
     def precision(self) -> Tensor:
-        """Prior precision of all stored values (amplitudes in order, then shapes): [k], 0 where there is no prior."""
+        """Prior precision of all stored values (amplitudes in order, then shapes): [k], 0 where there is no
+        prior.
+        """
         parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]
         return torch.cat(parts) if parts else torch.zeros(0)
 
@@ -134,7 +145,9 @@ class Effect(nn.Module, Hooks):
 
     @property
     def moves_light(self) -> bool:
-        """It moves light in time or scales it, path by path or spot by spot, as errors of places, normals and albedos do."""
+        """It moves light in time or scales it, path by path or spot by spot, as errors of places, normals and
+        albedos do.
+        """
         return any(getattr(type(self), hook) is not getattr(Hooks, hook) for hook in ("path", "time", "gain"))
 
     @property

@@ -12,16 +12,19 @@ from nlos_lit.effects.effect import Effect, Parameter
 class GateEdges(Effect):
     """Sensitivity rises at the start of the gate and falls at its end.
 
-    ``m'_t = m_t (1 - start e^{-(t - first)/w}) (1 - end e^{-(last - 1 - t)/w})`` for bins first ≤ t < last of the gate.
+    ``m'_t = m_t (1 - start e^{-(t - first)/w}) (1 - end e^{-(last - 1 - t)/w})`` for bins first ≤ t < last of
+    the gate.
 
-    Parameters: ``start``, ``end`` (1): share lost in the gate's first and last bin, null 0, at most 1. ``width`` w (bins), scanned.
+    Parameters: ``start``, ``end`` (1): share lost in the gate's first and last bin, null 0, at most 1.
+    ``width`` w (bins), scanned.
 
-    Signature: residual below 0 in the first or last bins of the gate, proportional to what is there, at every spot.
+    Signature: residual below 0 in the first or last bins of the gate, proportional to what is there, at every
+    spot.
 
     Degenerate with: ``direct_leak`` (of the other sign at the start), ``background_slope`` for large widths.
 
-    Source: gated SPADs: M. Buttafava et al., *Non-line-of-sight imaging using a time-gated single photon avalanche diode*, Opt.
-    Express 23, 2015.
+    Source: gated SPADs: M. Buttafava et al., *Non-line-of-sight imaging using a time-gated single photon
+    avalanche diode*, Opt. Express 23, 2015.
     """
 
     name = "gate_edges"

@@ -19,9 +19,11 @@ class GhostPulse(Effect):
 
     Signature: the whole record again, weaker and later, at every spot by the same delay.
 
-    Degenerate with: weak surfels behind the surface, where the delay is short; ``irf_tail`` for delays within the tail.
+    Degenerate with: weak surfels behind the surface, where the delay is short; ``irf_tail`` for delays within
+    the tail.
 
-    Source: W. Becker, *The bh TCSPC Handbook* (optical and electrical reflections in the instrument response).
+    Source: W. Becker, *The bh TCSPC Handbook* (optical and electrical reflections in the instrument
+    response).
     """
 
     name = "ghost_pulse"

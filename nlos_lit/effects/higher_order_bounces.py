@@ -19,27 +19,29 @@ SAMPLES = 512  # surfels between which throughput is worked out
 class HigherOrderBounces(Effect):
     """The fourth bounce laser → wall → surfel a → surfel b → wall → sensor is added to the third.
 
-    ``H_r → H_r + strength Σ_ab ρ_a ρ_b/π · F_l(a) A_a · cosθ_ab cosθ_ba/(d_ab² + A/π) · A_b F_s(b)`` at ``d_la + d_ab + d_bs``,
-    with ``F = cosθ_wall cosθ_surfel/d²`` of the leg from the wall; the common reflectances and 1/π of the wall are left out, as
-    in the third bounce. A, the mean area of the two, keeps the throughput of touching surfels finite. No surfel hides another
-    one.
+    ``H_r → H_r + strength Σ_ab ρ_a ρ_b/π · F_l(a) A_a · cosθ_ab cosθ_ba/(d_ab² + A/π) · A_b F_s(b)`` at
+    ``d_la + d_ab + d_bs``, with ``F = cosθ_wall cosθ_surfel/d²`` of the leg from the wall; the common
+    reflectances and 1/π of the wall are left out, as in the third bounce. A, the mean area of the two, keeps
+    the throughput of touching surfels finite. No surfel hides another one.
 
-    Estimator: surfels join in at most 48 clusters, cells of a cube lattice. Powers into and out of the clusters are exact sums
-    over their surfels: what leaves surfel a towards b is the third bounce's energy over its other leg, ``ρ A F_l = energy/F_s``.
-    The throughput between clusters is its mean over pairs of their surfels (of at most about 512 of them), the length likewise.
-    Arrivals are blurred over a cell.
+    Estimator: surfels join in at most 48 clusters, cells of a cube lattice. Powers into and out of the
+    clusters are exact sums over their surfels: what leaves surfel a towards b is the third bounce's energy
+    over its other leg, ``ρ A F_l = energy/F_s``. The throughput between clusters is its mean over pairs of
+    their surfels (of at most about 512 of them), the length likewise. Arrivals are blurred over a cell.
 
-    Parameters: ``strength`` (1), null 0; 1 is physical if albedo 1 means albedo 1. Here albedo is relative, so that strength
-    carries the unknown scale. Quantity ``share`` (1): fourth bounce over third, known after a rendering without gradients (its
-    last batch).
+    Parameters: ``strength`` (1), null 0; 1 is physical if albedo 1 means albedo 1. Here albedo is relative,
+    so that strength carries the unknown scale. Quantity ``share`` (1): fourth bounce over third, known after
+    a rendering without gradients (its last batch).
 
-    Signature: a broad excess behind concave surfaces, from twice the shortest leg plus a gap on; none for one flat or convex
-    surface.
+    Signature: a broad excess behind concave surfaces, from twice the shortest leg plus a gap on; none for one
+    flat or convex surface.
 
     Degenerate with: ``irf_tail``, weak surfels behind the surface, ``background_slope``.
 
-    Source: C. M. Goral et al., *Modeling the interaction of light between diffuse surfaces*, SIGGRAPH 1984; the bound for touching
-    surfels: J. R. Wallace, K. A. Elmquist, E. A. Haines, *A ray tracing algorithm for progressive radiosity*, SIGGRAPH 1989.
+    Source: C. M. Goral et al., *Modeling the interaction of light between diffuse surfaces*, SIGGRAPH 1984;
+    the bound for touching
+    surfels: J. R. Wallace, K. A. Elmquist, E. A. Haines, *A ray tracing algorithm for progressive radiosity*,
+        SIGGRAPH 1989.
     """
 
     name = "higher_order_bounces"
@@ -103,7 +105,9 @@ def clusters(centre: Tensor) -> tuple[Tensor, float]:
 
 
 def throughput(wall: Tensor, paths: Paths) -> tuple[Tensor, Tensor]:
-    """``cosθ_wall cosθ_surfel/d²`` and d, ``[B, M]``, from wall points ``[B, 3]`` (wall normal +z) to the surfels' centres."""
+    """``cosθ_wall cosθ_surfel/d²`` and d, ``[B, M]``, from wall points ``[B, 3]`` (wall normal +z) to the
+    surfels' centres.
+    """
     away = paths.centre - wall[:, None]
     square = away.square().sum(2)
     facing = -(away * paths.normal).sum(2)
@@ -111,7 +115,9 @@ def throughput(wall: Tensor, paths: Paths) -> tuple[Tensor, Tensor]:
 
 
 def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
-    """``cosθ cosθ/(d² + A/π)`` (1/m²) and d (m) between clusters, both ``[C, C]``, means over pairs of their surfels by area."""
+    """``cosθ cosθ/(d² + A/π)`` (1/m²) and d (m) between clusters, both ``[C, C]``, means over pairs of their
+    surfels by area.
+    """
     rank = (member.cumsum(0) * member).sum(1) - 1
     chosen = torch.nonzero(rank % math.ceil(len(rank) / SAMPLES) == 0)[:, 0]
     centre, normal, area = paths.centre[chosen], paths.normal[chosen], paths.area[chosen]
@@ -120,7 +126,8 @@ def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
     away = centre[None] - centre[:, None]
     leaving = (away * normal[:, None]).sum(2).clamp_min(0)
     square = away.square().sum(2)
-    # Ones keep the distance of a surfel from itself, and from one in the same place, differentiable; both cosines are 0.
+    # Ones keep the distance of a surfel from itself, and from one in the same place, differentiable; both
+    # cosines are 0.
     square = square + (square == 0)
     exchange = leaving * leaving.T / (square * (square + (area[:, None] + area) / (2 * math.pi)))
     total = share.T @ exchange @ share
@@ -129,7 +136,9 @@ def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def blurred(arrivals: Tensor, side: float) -> Tensor:
-    """``[B, T]`` spread in time as over two cells of ``side`` bins: a Gaussian of their joint standard deviation at 45°."""
+    """``[B, T]`` spread in time as over two cells of ``side`` bins: a Gaussian of their joint standard
+    deviation at 45°.
+    """
     sigma = max(side / math.sqrt(12), 1e-3)
     lead = math.ceil(3 * sigma)
     offset = torch.arange(-lead, lead + 1, dtype=arrivals.dtype, device=arrivals.device)

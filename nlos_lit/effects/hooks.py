@@ -8,7 +8,9 @@ from nlos_lit.functional.surfel_paths import Paths
 
 
 class Hooks:
-    """Where physical effects act; this base class does nothing at every stage. Shapes as in :meth:`SurfelModel.render`."""
+    """Where physical effects act; this base class does nothing at every stage. Shapes as in
+    :meth:`SurfelModel.render`.
+    """
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         """``[B, M, Q]`` energy of each path."""

@@ -11,16 +11,18 @@ HOT = 0.25  # of the hottest spot: from there on a spot counts as hot
 
 
 class HotSpots(Effect):
-    """Some spots have a constant background of their own: hot pixels, a bright reflection, interference during their exposure.
+    """Some spots have a constant background of their own: hot pixels, a bright reflection, interference
+    during their exposure.
 
     ``background → background + extra_s``, extra ≥ 0 and 0 at most spots
 
-    Parameters: ``extra`` (counts/bin), one for each spot, null 0. Quantities ``level`` (counts/bin, mean of the hot spots) and
-    ``number`` (1): spots of at least a quarter of the hottest one's extra.
+    Parameters: ``extra`` (counts/bin), one for each spot, null 0. Quantities ``level`` (counts/bin, mean of
+    the hot spots) and ``number`` (1): spots of at least a quarter of the hottest one's extra.
 
     Signature: single spots with a residual above 0 in all bins alike.
 
-    Degenerate with: nothing that is smooth over the wall; ``ambient_map`` takes part of a cluster of hot spots.
+    Degenerate with: nothing that is smooth over the wall; ``ambient_map`` takes part of a cluster of hot
+    spots.
 
     Source: none needed, a constant per spot.
     """

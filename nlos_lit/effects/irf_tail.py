@@ -17,12 +17,14 @@ class IrfTail(Effect):
 
     Parameters: ``fraction`` f (1), null 0. ``decay`` τ (m of path), scanned.
 
-    Signature: residuals above 0 for tens of bins after every strong return, at every spot alike; energy is conserved.
+    Signature: residuals above 0 for tens of bins after every strong return, at every spot alike; energy is
+    conserved.
 
-    Degenerate with: ``afterpulsing`` (the same delay, after background counts too), weak surfels behind the surface.
+    Degenerate with: ``afterpulsing`` (the same delay, after background counts too), weak surfels behind the
+    surface.
 
-    Source: diffusion tail of silicon SPADs: carriers from the neutral region reach the junction late (S. Cova et al.,
-    *Avalanche photodiodes and quenching circuits for single-photon detection*, Appl. Opt. 35, 1996).
+    Source: diffusion tail of silicon SPADs: carriers from the neutral region reach the junction late (S. Cova
+    et al., *Avalanche photodiodes and quenching circuits for single-photon detection*, Appl. Opt. 35, 1996).
     """
 
     name = "irf_tail"

@@ -17,9 +17,11 @@ class LaserSensorBaseline(Effect):
 
     Parameters: ``baseline_x``, ``baseline_y`` (m), null 0.
 
-    Signature: edges in time shifted by ``-b·(p - s)/d2``: one sign for scene on one side of a spot, the other for the other side.
+    Signature: edges in time shifted by ``-b·(p - s)/d2``: one sign for scene on one side of a spot, the other
+    for the other side.
 
-    Degenerate with: a sideways shift of the scene by half the baseline, exactly so for confocal scans of far scenes; ``wall_tilt``.
+    Degenerate with: a sideways shift of the scene by half the baseline, exactly so for confocal scans of far
+    scenes; ``wall_tilt``.
 
     Source: geometry.
     """

@@ -15,16 +15,19 @@ EDGE = 0.12  # width of the soft edge, in radii
 class Occlusion(Effect):
     """An unseen black disc, parallel to the wall, blocks legs that cross it.
 
-    ``K → K T_laser T_sensor``, ``T = 1 - opacity σ((radius - ρ)/w) σ((z_surfel - z)/w)``, ρ the distance from the disc's axis at
-    which the leg crosses the plane z, w = 0.12 radius; a leg is taken as the line to the surfel's centre.
+    ``K → K T_laser T_sensor``, ``T = 1 - opacity σ((radius - ρ)/w) σ((z_surfel - z)/w)``, ρ the distance from
+    the disc's axis at which the leg crosses the plane z, w = 0.12 radius; a leg is taken as the line to the
+    surfel's centre.
 
     Parameters: ``opacity`` (1), null 0, at most 1. ``x``, ``y``, ``z``, ``radius`` (m), scanned.
 
     Signature: light missing at spots and depths that lie on lines through one region.
 
-    Degenerate with: albedo and normals of surfels that few spots see; ``wall_reflectance`` when the disc is near the wall.
+    Degenerate with: albedo and normals of surfels that few spots see; ``wall_reflectance`` when the disc is
+    near the wall.
 
-    Source: F. Heide et al., *Non-line-of-sight imaging with partial occluders and surface normals*, ACM Trans. Graph. 38, 2019.
+    Source: F. Heide et al., *Non-line-of-sight imaging with partial occluders and surface normals*, ACM
+    Trans. Graph. 38, 2019.
     """
 
     name = "occlusion"

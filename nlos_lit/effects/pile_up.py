@@ -12,16 +12,19 @@ from nlos_lit.effects.effect import Effect, Parameter
 class PileUp(Effect):
     """At most one photon is counted in a laser cycle.
 
-    ``m'_t = N (1 - e^{-m_t/N}) · e^{-Σ_{s<t} m_s/N}``, N the number of laser cycles per spot, ``N = mean counts/detections``; t
-    from bin 0 of the record on.
+    ``m'_t = N (1 - e^{-m_t/N}) · e^{-Σ_{s<t} m_s/N}``, N the number of laser cycles per spot, ``N = mean
+    counts/detections``; t from bin 0 of the record on.
 
-    Parameters: ``detections`` (1): counts recorded per cycle, averaged over the spots; null 0 (N → ∞), below 1.
+    Parameters: ``detections`` (1): counts recorded per cycle, averaged over the spots; null 0 (N → ∞), below
+    1.
 
     Signature: late returns and late background too weak, the more so the brighter the spot.
 
-    Degenerate with: ``background_slope`` (which is equal at all spots), ``irf_tail``; a scan whose spots are equally bright.
+    Degenerate with: ``background_slope`` (which is equal at all spots), ``irf_tail``; a scan whose spots are
+    equally bright.
 
-    Source: P. B. Coates, *The correction for photon 'pile-up' in the measurement of radiative lifetimes*, J. Phys. E 1, 1968.
+    Source: P. B. Coates, *The correction for photon 'pile-up' in the measurement of radiative lifetimes*, J.
+    Phys. E 1, 1968.
     """
 
     name = "pile_up"

@@ -15,14 +15,16 @@ from nlos_lit.effects.smooth import SmoothEffect, over_time
 class PowerDrift(SmoothEffect):
     """The laser gets stronger or weaker, or the detector's efficiency drifts.
 
-    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its constant.
+    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions
+    without its constant.
 
-    Parameters: ``drift`` (1, logarithm of the gain), 5 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (1).
+    Parameters: ``drift`` (1, logarithm of the gain), 5 coefficients, null 0. Quantities ``rms`` and
+    ``peak_to_peak`` (1).
 
     Signature: spot totals follow the order of acquisition; the shape in time is right.
 
-    Degenerate with: ``wall_reflectance`` in a raster scan, which can be any smooth function of the slow axis; normals of a small
-    scene.
+    Degenerate with: ``wall_reflectance`` in a raster scan, which can be any smooth function of the slow axis;
+    normals of a small scene.
 
     Source: none needed, a smooth gain.
     """

@@ -11,19 +11,22 @@ from nlos_lit.functional.surfel_paths import Paths
 
 
 class Retroreflection(Effect):
-    """Brightness falls more slowly with distance, and depends less on the surface's tilt, than that of diffuse surfaces.
+    """Brightness falls more slowly with distance, and depends less on the surface's tilt, than that of
+    diffuse surfaces.
 
-    ``d1⁻² d2⁻² cosθ2 cosθ3 → (d1 d2)^{-falloff/2} d0^{falloff-4} (cosθ2 cosθ3)^cosine``, d0 half the path at the middle of the
-    gate.
+    ``d1⁻² d2⁻² cosθ2 cosθ3 → (d1 d2)^{-falloff/2} d0^{falloff-4} (cosθ2 cosθ3)^cosine``, d0 half the path at
+    the middle of the gate.
 
-    Parameters: ``falloff`` (1), null 4; 2 for a confocal retroreflector. ``cosine`` (1), null 1; 0 for one. Both may pass
-    the null by a little only: brighter near than a diffuse surface nothing is.
+    Parameters: ``falloff`` (1), null 4; 2 for a confocal retroreflector. ``cosine`` (1), null 1; 0 for one.
+    Both may pass the null by a little only: brighter near than a diffuse surface nothing is.
 
     Signature: with a large wall, a smooth map over wall positions and depths: far spots are too bright.
 
-    Degenerate with: ``vignetting`` and ``wall_reflectance`` when the scene is shallow (one distance per spot), ``specular_lobe``.
+    Degenerate with: ``vignetting`` and ``wall_reflectance`` when the scene is shallow (one distance per
+    spot), ``specular_lobe``.
 
-    Source: M. O'Toole, D. B. Lindell, G. Wetzstein, *Confocal non-line-of-sight imaging based on the light-cone transform*, Nature
+    Source: M. O'Toole, D. B. Lindell, G. Wetzstein, *Confocal non-line-of-sight imaging based on the
+    light-cone transform*, Nature
     555, 2018: r⁻⁴ for diffuse, r⁻² for retroreflective scenes.
     """
 

@@ -13,11 +13,12 @@ from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis
 
 
 class SmoothEffect(Effect):
-    """One parameter, the coefficients ``c`` of ``f(s) = Σ_k c_k b_k(s)``; the b_k average to zero with mean square 1 over the scan.
+    """One parameter, the coefficients ``c`` of ``f(s) = Σ_k c_k b_k(s)``; the b_k average to zero with mean
+    square 1 over the scan.
 
-    The rougher a b_k, the smaller its coefficient is taken to be (prior): deviation ``likely`` of the smoothest, falling with the
-    third power of the frequency (Sobolev smoothness 2 over a plane). Without it, coefficients that the fitted spots hardly settle
-    run wild on those that were not fitted.
+    The rougher a b_k, the smaller its coefficient is taken to be (prior): deviation ``likely`` of the
+    smoothest, falling with the third power of the frequency (Sobolev smoothness 2 over a plane). Without it,
+    coefficients that the fitted spots hardly settle run wild on those that were not fitted.
 
     Attributes:
         coefficients: name of the parameter.
@@ -67,7 +68,9 @@ def over_time(scan: Scan) -> tuple[Tensor, Tensor]:
 
 
 def over_wall(scan: Scan, n: int) -> tuple[Tensor, Tensor]:
-    """``[S, ≤ n² - 1]`` smooth functions of the wall point, of both added where laser and sensor move; and their shares."""
+    """``[S, ≤ n² - 1]`` smooth functions of the wall point, of both added where laser and sensor move; and
+    their shares.
+    """
     functions, share = smooth_map_basis(torch.cat(scan.places), n)
     return functions.view(len(scan.places), scan.n_spots, -1).sum(0), share
 

@@ -13,14 +13,15 @@ from nlos_lit.functional.surfel_paths import Paths
 class SpecularLobe(Effect):
     """The diffuse reflectance gets a lobe about the mirror direction.
 
-    ``K → K (1 + strength (p + 2)/2 · cos^p θh)``, θh between the normal and the half vector of the directions to the two wall
-    points.
+    ``K → K (1 + strength (p + 2)/2 · cos^p θh)``, θh between the normal and the half vector of the directions
+    to the two wall points.
 
     Parameters: ``strength`` (1: as much light as the diffuse part), null 0. ``exponent`` p (1), scanned.
 
     Signature: bright patches on the wall, opposite to surfaces that face it; they move with the normal.
 
-    Degenerate with: albedo of single surfels (a lobe seen from few spots), ``retroreflection``; in confocal scans with it alone.
+    Degenerate with: albedo of single surfels (a lobe seen from few spots), ``retroreflection``; in confocal
+    scans with it alone.
 
     Source: J. F. Blinn, *Models of light reflection for computer synthesized pictures*, SIGGRAPH 1977.
     """

@@ -1,4 +1,6 @@
-"""Effects at given strengths: scalars from a command line, random fields scaled to them, and what is reported of effects."""
+"""Effects at given strengths: scalars from a command line, random fields scaled to them, and what is reported
+of effects.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from nlos_lit.effects.timing_jitter import TimingJitter
 
 
 def typical(scan: Scan) -> dict[str, dict[str, float]]:
-    """A strength that is clearly visible, for every effect, by the names of :func:`settable`; scanned parameters are left out."""
+    """A strength that is clearly visible, for every effect, by the names of :func:`settable`; scanned
+    parameters are left out.
+    """
     bins = scan.bin_length
     return {
         "retroreflection": {"falloff": 2.0, "cosine": 0.0},
@@ -66,14 +70,16 @@ def effects_at(
 
     Args:
         names: of the registry.
-        values: ``EFFECT.PARAMETER`` → value, see :func:`settable`. An effect of which no amplitude is given has that of
-            :func:`typical`; else amplitudes that are not given are at their null. Scanned parameters that are not given are at the
-            middle of their grids. ``hot_spots`` completes ``level`` or ``number`` alone by the typical other one.
+        values: ``EFFECT.PARAMETER`` → value, see :func:`settable`. An effect of which no amplitude is given
+            has that of :func:`typical`; else amplitudes that are not given are at their null. Scanned
+            parameters that are not given are at the middle of their grids. ``hot_spots`` completes ``level``
+            or ``number`` alone by the typical other one.
         seed: of random coefficients; None is 0. Every effect draws its own, whatever others there are.
         exposure: factor on given values in counts per bin.
 
     Raises:
-        UserError: an unknown effect or parameter, a parameter of an effect that is not named, a value out of bounds.
+        UserError: an unknown effect or parameter, a parameter of an effect that is not named, a value out of
+            bounds.
     """
     effects = build_effects(names, scan)
     known = {effect.name: settable(effect) for effect in effects}

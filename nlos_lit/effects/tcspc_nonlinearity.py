@@ -19,15 +19,17 @@ class TcspcNonlinearity(Effect):
 
     ``m'_t = m_t (1 + sine · sin(2πt/P) + cosine · cos(2πt/P))``, t the bin number.
 
-    Parameters: ``sine``, ``cosine`` (1), null 0. ``period`` P (bins), scanned uniformly in 1/P from 1/40 (or two periods in the
-    gate) to 1/2.2, with steps of 1/(1.5 gate) but at most 200 values. Quantities ``amplitude`` (1, the root of both squares) and
-    ``period`` (bins).
+    Parameters: ``sine``, ``cosine`` (1), null 0. ``period`` P (bins), scanned uniformly in 1/P from 1/40 (or
+    two periods in the gate) to 1/2.2, with steps of 1/(1.5 gate) but at most 200 values. Quantities
+    ``amplitude`` (1, the root of both squares) and ``period`` (bins).
 
-    Signature: a ripple in time at all spots, in phase with the bin number and not with the arrival; also in the background.
+    Signature: a ripple in time at all spots, in phase with the bin number and not with the arrival; also in
+    the background.
 
     Degenerate with: ``background_slope`` for periods beyond the gate; with nothing else.
 
-    Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (differential non-linearity).
+    Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (differential
+    non-linearity).
     """
 
     name = "tcspc_nonlinearity"

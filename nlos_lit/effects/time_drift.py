@@ -15,13 +15,15 @@ from nlos_lit.functional.surfel_paths import Paths
 class TimeDrift(SmoothEffect):
     """The delay between laser and detector drifts, as with temperature.
 
-    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its constant.
+    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its
+    constant.
 
     Parameters: ``drift`` (m of path), 5 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (m).
 
     Signature: residuals of both signs at every edge in time, their sign changing along the scan.
 
-    Degenerate with: ``wall_tilt`` in a raster scan (slow axis = scan order); a serpentine scan or columns split nothing more.
+    Degenerate with: ``wall_tilt`` in a raster scan (slow axis = scan order); a serpentine scan or columns
+    split nothing more.
 
     Source: W. Becker, *The bh TCSPC Handbook* (timing drift of detector and trigger).
     """

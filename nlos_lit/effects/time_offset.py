@@ -16,10 +16,11 @@ class TimeOffset(Effect):
 
     Parameters: ``offset`` (m of path), null 0.
 
-    Signature: lines of equal delay are not the right ellipsoids: depths and curvature disagree between near and far spots.
+    Signature: lines of equal delay are not the right ellipsoids: depths and curvature disagree between near
+    and far spots.
 
-    Degenerate with: the scene's depth: only the curvature over the wall tells them apart, so that little information is retained;
-    ``clock_scale``.
+    Degenerate with: the scene's depth: only the curvature over the wall tells them apart, so that little
+    information is retained; ``clock_scale``.
 
     Source: W. Becker, *The bh TCSPC Handbook* (delay of cables and detector).
     """

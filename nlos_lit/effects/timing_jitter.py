@@ -15,10 +15,11 @@ class TimingJitter(Effect):
 
     ``L → L + δ_s``, ``δ_s ~ N(0, σ²)``, independent
 
-    Parameters: ``offset`` δ (m of path), one for each spot, null 0. Quantity ``sigma`` (m): the width of their
-    distribution where it was fitted, else the root mean square of those that are not exactly 0.
+    Parameters: ``offset`` δ (m of path), one for each spot, null 0. Quantity ``sigma`` (m): the width of
+    their distribution where it was fitted, else the root mean square of those that are not exactly 0.
 
-    Signature: residuals of both signs at edges in time, all of one spot with the same sign, neighbouring spots unrelated.
+    Signature: residuals of both signs at edges in time, all of one spot with the same sign, neighbouring
+    spots unrelated.
 
     Degenerate with: nothing smooth; a wide response (``sigma_ls``) when spots are summed.
 

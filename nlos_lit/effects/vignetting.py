@@ -12,14 +12,15 @@ from nlos_lit.effects.effect import Effect, Parameter
 class Vignetting(Effect):
     """Spots away from the middle of the scanned wall are darker (or, with the other sign, brighter).
 
-    ``signal → signal · e^{-strength |x|²}``, x the spot's place in [-1, 1]²; |x|² of laser and sensor added where both move.
+    ``signal → signal · e^{-strength |x|²}``, x the spot's place in [-1, 1]²; |x|² of laser and sensor added
+    where both move.
 
     Parameters: ``strength`` (1), null 0, of either sign.
 
     Signature: spot totals fall off radially from the wall's centre; the shape in time is right.
 
-    Degenerate with: ``wall_reflectance`` (any smooth map), ``retroreflection`` of a shallow scene before the wall's centre,
-    normals.
+    Degenerate with: ``wall_reflectance`` (any smooth map), ``retroreflection`` of a shallow scene before the
+    wall's centre, normals.
 
     Source: to second order the cos⁴ law of lenses: B. K. P. Horn, *Robot Vision*, 1986, ch. 10.
     """

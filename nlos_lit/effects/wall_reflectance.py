@@ -13,15 +13,16 @@ from nlos_lit.effects.smooth import SmoothEffect, over_wall
 class WallReflectance(SmoothEffect):
     """The wall's reflectance, or the efficiency of laser and sensor optics, varies smoothly over the wall.
 
-    ``signal → signal · e^{f(x, y)}``, f a 6×6 tensor product of cubic splines without its constant; ``e^{f(laser) + f(sensor)}``
-    where both points move, with one f for both.
+    ``signal → signal · e^{f(x, y)}``, f a 6×6 tensor product of cubic splines without its constant;
+    ``e^{f(laser) + f(sensor)}`` where both points move, with one f for both.
 
-    Parameters: ``gain_map`` (1, logarithm), at most 35 coefficients, null 0. Quantity ``rms`` (1) of the logarithm.
+    Parameters: ``gain_map`` (1, logarithm), at most 35 coefficients, null 0. Quantity ``rms`` (1) of the
+    logarithm.
 
     Signature: spot totals form a smooth map over the wall; the shape in time is right.
 
-    Degenerate with: ``vignetting`` (one such map), ``power_drift`` in a raster scan, normals of a small scene,
-    ``retroreflection`` of a shallow one.
+    Degenerate with: ``vignetting`` (one such map), ``power_drift`` in a raster scan, normals of a small
+    scene, ``retroreflection`` of a shallow one.
 
     Source: splines: C. de Boor, *A Practical Guide to Splines*, 1978.
     """

@@ -10,16 +10,18 @@ from nlos_lit.functional.surfel_paths import Paths
 
 
 class WallTilt(Effect):
-    """The wall points really stand at ``z = tilt_x X + tilt_y Y`` beyond their stated places; X, Y from the scan's centre.
+    """The wall points really stand at ``z = tilt_x X + tilt_y Y`` beyond their stated places; X, Y from the
+    scan's centre.
 
-    ``L → L - cosθ_laser z_laser - cosθ_sensor z_sensor``, cosθ between the wall's normal and the leg to the surfel's centre.
+    ``L → L - cosθ_laser z_laser - cosθ_sensor z_sensor``, cosθ between the wall's normal and the leg to the
+    surfel's centre.
 
     Parameters: ``tilt_x``, ``tilt_y`` (rad), null 0.
 
     Signature: edges in time early on one side of the wall and late on the other.
 
-    Degenerate with: a turn of the whole scene about the wall's centre (almost perfectly, for small scenes); ``time_drift`` along
-    the slow axis of a raster scan.
+    Degenerate with: a turn of the whole scene about the wall's centre (almost perfectly, for small scenes);
+    ``time_drift`` along the slow axis of a raster scan.
 
     Source: geometry, to first order in the tilt.
     """

@@ -7,7 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-# Largest change of a square coordinate per radian on the hemisphere: √(1/4 + 16/π²) = 1.368, reached at the horizon's seams.
+# Largest change of a square coordinate per radian on the hemisphere: √(1/4 + 16/π²) = 1.368, reached at the
+# horizon's seams.
 LIPSCHITZ = 1.37
 
 
@@ -23,7 +24,9 @@ def square_to_hemisphere(square: Tensor) -> Tensor:
 
 
 def hemisphere_to_square(direction: Tensor) -> Tensor:
-    """Inverse of :func:`square_to_hemisphere` for unit directions ``[…, 3]``; below the horizon the map continues smoothly."""
+    """Inverse of :func:`square_to_hemisphere` for unit directions ``[…, 3]``; below the horizon the map
+    continues smoothly.
+    """
     x, y, z = direction.unbind(-1)
     radius = torch.sqrt((1 - z).clamp_min(0))
     wide = x.abs() >= y.abs()
@@ -35,14 +38,18 @@ def hemisphere_to_square(direction: Tensor) -> Tensor:
 
 
 def ray_grid(n: int, device: torch.device | str = "cpu") -> Tensor:
-    """``[n·n, 3]`` directions at the cell centres of an n × n grid over the square; ray ``i·n + j`` is cell (i, j)."""
+    """``[n·n, 3]`` directions at the cell centres of an n × n grid over the square; ray ``i·n + j`` is cell
+    (i, j).
+    """
     centres = (2 * torch.arange(n, dtype=torch.float64, device=device) + 1) / n - 1
     grid = torch.stack(torch.meshgrid(centres, centres, indexing="ij"), dim=-1)
     return square_to_hemisphere(grid).reshape(-1, 3).to(torch.float32)
 
 
 def wall_frame(normal: Tensor) -> Tensor:
-    """``[S, 3, 3]`` rotations from a wall point's local frame (z along its normal) to the world; identity for a normal +z."""
+    """``[S, 3, 3]`` rotations from a wall point's local frame (z along its normal) to the world; identity for
+    a normal +z.
+    """
     upright = (normal[:, 1:2].abs() < 0.9).to(normal.dtype)  # up (0, 1, 0) helps, else (1, 0, 0)
     helper = torch.cat([1 - upright, upright, torch.zeros_like(upright)], dim=1)
     x = torch.nn.functional.normalize(torch.linalg.cross(helper, normal), dim=1)

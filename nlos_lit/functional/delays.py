@@ -7,7 +7,9 @@ from torch import Tensor
 
 
 def geometric(low: float, high: float, n: int) -> tuple[float, ...]:
-    """``n`` values from ``low`` to ``high`` with a constant ratio; only ``low`` where ``high`` is not above it."""
+    """``n`` values from ``low`` to ``high`` with a constant ratio; only ``low`` where ``high`` is not above
+    it.
+    """
     return tuple(low * (high / low) ** (k / (n - 1)) for k in range(n)) if high > low else (low,)
 
 
@@ -18,7 +20,9 @@ def whole_record(kernel: Tensor, lead: int, n_bins: int) -> Tensor:
 
 
 def convolve(values: Tensor, kernel: Tensor) -> Tensor:
-    """``[…, T]`` causal convolution of ``values`` ``[…, T]`` with ``kernel`` ``[K]``; what leaves the end is lost."""
+    """``[…, T]`` causal convolution of ``values`` ``[…, T]`` with ``kernel`` ``[K]``; what leaves the end is
+    lost.
+    """
     size = values.shape[-1] + len(kernel)
     return torch.fft.irfft(torch.fft.rfft(values, size) * torch.fft.rfft(kernel, size), size)[
         ..., : values.shape[-1]

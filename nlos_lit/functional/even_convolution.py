@@ -1,6 +1,8 @@
-"""Linear convolution with kernels that are even in x and y, and their phases, for propagation from plane to plane.
+"""Linear convolution with kernels that are even in x and y, and their phases, for propagation from plane to
+plane.
 
-A kernel that is even along both axes and its spectrum are known by a quarter of their values; only these are evaluated.
+A kernel that is even along both axes and its spectrum are known by a quarter of their values; only these are
+evaluated.
 """
 
 from __future__ import annotations
@@ -12,10 +14,11 @@ from torch import Tensor
 
 
 class EvenAxis:
-    """One axis of a convolution whose kernel is even: voxel m lies ``m + offset - n`` steps from aperture point n.
+    """One axis of a convolution whose kernel is even: voxel m lies ``m + offset - n`` steps from aperture
+    point n.
 
-    The kernel's centre is put at index 0 and the transform is long enough to hold it mirrored, so that halves of the kernel and of
-    its spectrum are all there is; ``shift`` brings voxel 0 back to index 0.
+    The kernel's centre is put at index 0 and the transform is long enough to hold it mirrored, so that halves
+    of the kernel and of its spectrum are all there is; ``shift`` brings voxel 0 back to index 0.
     """
 
     def __init__(self, n: int, m: int, offset: int, device: torch.device) -> None:
@@ -35,7 +38,9 @@ class EvenAxis:
 
 
 def convolution_length(n: int, m: int, offset: int) -> int:
-    """Points of the zero-padded transform along an axis of n aperture points and m voxels that start ``offset`` steps further."""
+    """Points of the zero-padded transform along an axis of n aperture points and m voxels that start
+    ``offset`` steps further.
+    """
     return next_fast_length(max(n + m - 1, 2 * max(abs(offset + 1 - n), abs(offset + m - 1))))
 
 
@@ -61,9 +66,11 @@ def mirror(halves: Tensor, dim: int, axis: EvenAxis) -> Tensor:
 
 
 def even_transform(quarter: Tensor, x: EvenAxis, y: EvenAxis) -> Tensor:
-    """A quarter of the 2-D Fourier transform of kernels even along both axes, from a quarter of them ``[F, hx, hy]``.
+    """A quarter of the 2-D Fourier transform of kernels even along both axes, from a quarter of them ``[F,
+    hx, hy]``.
 
-    As matrix products: a transform of a few hundred real cosines runs at several times the speed of an FFT of twice the length.
+    As matrix products: a transform of a few hundred real cosines runs at several times the speed of an FFT of
+    twice the length.
     """
     real, imaginary = (x.cosines.T @ (part.contiguous() @ y.cosines) for part in (quarter.real, quarter.imag))
     return torch.complex(real, imaginary)
@@ -75,7 +82,9 @@ def inverse(spectra: Tensor, mx: int, my: int) -> Tensor:
 
 
 class Rotation:
-    """``e^{-iΩ_k R}/R^power`` for equally spaced Ω: double precision once for a run of them, then doubling by complex products."""
+    """``e^{-iΩ_k R}/R^power`` for equally spaced Ω: double precision once for a run of them, then doubling by
+    complex products.
+    """
 
     def __init__(self, distance: Tensor, step: float, most: int, power: int) -> None:
         self.distance, self.magnitude = distance, 1 / distance**power
@@ -100,7 +109,8 @@ class Rotation:
 
 
 def runs(n: int, size: int, device: torch.device) -> list[slice]:
-    """0 … n in runs whose n × size complex numbers fill 16 MiB, small enough for caches and for memory to be used again.
+    """0 … n in runs whose n × size complex numbers fill 16 MiB, small enough for caches and for memory to be
+    used again.
 
     On a GPU 1 GiB, so that it has enough to do at once.
     """

@@ -1,7 +1,9 @@
-"""The march of :mod:`nlos_lit.functional.march` with tensors of fixed size, so that a GPU never waits for the host.
+"""The march of :mod:`nlos_lit.functional.march` with tensors of fixed size, so that a GPU never waits for the
+host.
 
-The host cannot know how many rays meet something without waiting for the device. Here it gives capacities instead; what was
-needed is counted on the device and may be read now and then. Samples and hits are those of the other march while they fit.
+The host cannot know how many rays meet something without waiting for the device. Here it gives capacities
+instead; what was needed is counted on the device and may be read now and then. Samples and hits are those of
+the other march while they fit.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ class Capacity(NamedTuple):
 
 
 class StaticSamples(NamedTuple):
-    """``2·fine + 1`` samples around the maximum of each of ``capacity.rays`` rays; rows that are not ``used`` mean nothing."""
+    """``2·fine + 1`` samples around the maximum of each of ``capacity.rays`` rays; rows that are not ``used``
+    mean nothing.
+    """
 
     line: Tensor  # [K] spot·n² + ray
     used: Tensor  # [K] bool
@@ -36,7 +40,9 @@ class StaticSamples(NamedTuple):
 
 
 def compact(mask: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Places of the first ``capacity`` True elements (0 behind the last), which of these rows are used, and how many were True."""
+    """Places of the first ``capacity`` True elements (0 behind the last), which of these rows are used, and
+    how many were True.
+    """
     rank = torch.cumsum(mask, 0)
     row = torch.where(mask & (rank <= capacity), rank - 1, capacity)
     places = torch.zeros(capacity + 1, dtype=torch.long, device=mask.device)

@@ -1,4 +1,6 @@
-"""Laser-sensor response Ψ, Eq. 10, in closed form: an exponential decay convolved with a Gaussian, integrated over time bins."""
+"""Laser-sensor response Ψ, Eq. 10, in closed form: an exponential decay convolved with a Gaussian, integrated
+over time bins.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,9 @@ from torch import Tensor
 def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
     """Distribution function of ``κ e^{-κt} * N(0, σ)``: ``F(t) = Φ(t/σ) - e^{-κt + κ²σ²/2} Φ(t/σ - κσ)``.
 
-    Accurate for σ and 1/κ far below or far above the spacing of ``time`` (same unit as ``sigma`` and ``1/kappa``): Φ(x) of a
-    negative x is ½ e^{-x²/2} erfcx(-x/√2), so that the huge exponential of the second term meets the tiny Φ analytically, and in
-    the left tail both terms share the factor e^{-t²/(2σ²)}.
+    Accurate for σ and 1/κ far below or far above the spacing of ``time`` (same unit as ``sigma`` and
+    ``1/kappa``): Φ(x) of a negative x is ½ e^{-x²/2} erfcx(-x/√2), so that the huge exponential of the second
+    term meets the tiny Φ analytically, and in the left tail both terms share the factor e^{-t²/(2σ²)}.
     """
     scaled = time / sigma
     late = scaled - kappa * sigma
@@ -40,7 +42,9 @@ def response(sigma: Tensor, kappa: Tensor, n_bins: int, lead: int) -> Tensor:
 
 
 def convolve_time(transients: Tensor, kernel: Tensor, lead: int) -> Tensor:
-    """Causal-with-lead linear convolution of ``[S, T]`` with ``[K]`` along time by zero-padded FFT; result ``[S, T]``."""
+    """Causal-with-lead linear convolution of ``[S, T]`` with ``[K]`` along time by zero-padded FFT; result
+    ``[S, T]``.
+    """
     bins, length = transients.shape[1], kernel.shape[0]
     size = bins + length - 1
     size += size % 2

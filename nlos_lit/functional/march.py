@@ -1,9 +1,10 @@
 """Ray marching through a volume that is mostly empty: only samples in occupied bricks are ever touched.
 
-A dense march of the paper's batch (32 spots × 40 000 rays × several hundred samples) interpolates some 10⁹ samples for 10⁵ hits.
-Here the few bricks that hold a voxel above the threshold are projected into every spot's ray grid, the rays of that neighbourhood
-are clipped against the brick, and only those chords are sampled, unless a brighter sample is known already. The result is that of
-the dense march: a sample has a corner voxel no lower than itself, so it lies in a brick with a maximum no lower.
+A dense march of the paper's batch (32 spots × 40 000 rays × several hundred samples) interpolates some 10⁹
+samples for 10⁵ hits. Here the few bricks that hold a voxel above the threshold are projected into every
+spot's ray grid, the rays of that neighbourhood are clipped against the brick, and only those chords are
+sampled, unless a brighter sample is known already. The result is that of the dense march: a sample has a
+corner voxel no lower than itself, so it lies in a brick with a maximum no lower.
 """
 
 from __future__ import annotations
@@ -92,7 +93,9 @@ class _Trilinear(torch.autograd.Function):
 
 @torch.no_grad()
 def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
-    """:func:`trilinear` without gradients; of points in single precision by a fused, faster kernel good to 1e-5 voxels."""
+    """:func:`trilinear` without gradients; of points in single precision by a fused, faster kernel good to
+    1e-5 voxels.
+    """
     if points.dtype == torch.float64:
         parts, flat = points.split(_ROWS) if points.device.type == "cpu" else (points,), volume.reshape(-1)
         return torch.cat(
@@ -117,7 +120,8 @@ def constants(values: Sequence[float], like: Tensor) -> Tensor:
 def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
     """Values of ``volume`` ``[nz, nx, ny]`` at ``[M, 3]`` (y, x, z) in [-1, 1]; beyond, those of the border.
 
-    The kernel is parallel over its batch only, so the points are dealt into as many batches as keep all threads busy.
+    The kernel is parallel over its batch only, so the points are dealt into as many batches as keep all
+    threads busy.
     """
     batches = 4 * torch.get_num_threads() if volume.device.type == "cpu" else 1
     count = len(unit)
@@ -132,7 +136,8 @@ def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
 
 
 def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
-    """``[B, 3]`` (z, x, y) indices of bricks of ``size`` cells in which some corner voxel reaches ``threshold``.
+    """``[B, 3]`` (z, x, y) indices of bricks of ``size`` cells in which some corner voxel reaches
+    ``threshold``.
 
     A cell lies between neighbouring voxel centres; brick ``b`` holds cells ``b·size … (b+1)·size - 1``.
     """
@@ -166,8 +171,8 @@ def march(
 ) -> Samples:
     """Find, on every ray that meets the threshold, the samples that decide where its surface lies.
 
-    With ``fine = 1`` these are all samples within ``reach`` of the ray's largest intensity. Otherwise the ray is sampled anew,
-    ``fine`` times denser, from one step before to one step behind its largest sample.
+    With ``fine = 1`` these are all samples within ``reach`` of the ray's largest intensity. Otherwise the ray
+    is sampled anew, ``fine`` times denser, from one step before to one step behind its largest sample.
 
     Args:
         volume: ``[nz, nx, ny]`` intensity, scaled to a unit maximum.
@@ -193,7 +198,8 @@ def march(
     last = torch.tensor([lattice.shape[1], lattice.shape[2], lattice.shape[0]], device=device) - 1
     extent = edge * lattice.pitch
     cells = bricks[:, [1, 2, 0]]
-    # Opposite corners; neighbours share the very same number, so that a sample on a face belongs to one brick only.
+    # Opposite corners; neighbours share the very same number, so that a sample on a face belongs to one brick
+    # only.
     start = lattice.origin + cells * edge * lattice.pitch
     end = lattice.origin + torch.minimum((cells + 1) * edge, last) * lattice.pitch
     world = torch.einsum("sij,rj->sri", frames, rays).reshape(-1, 3)
@@ -251,7 +257,8 @@ def march(
         position = (
             origins[hits // (n * n)][hit] + distance[:, None] * direction[hit] - lattice.origin
         ) / lattice.pitch
-        # Outside the volume there is no intensity, so no surface either; the largest sample stays whatever the rounding.
+        # Outside the volume there is no intensity, so no surface either; the largest sample stays whatever
+        # the rounding.
         inside = ((position >= 0) & (position <= last)).all(1) | (offsets == 0).repeat(len(hits))
         distance, hit = distance[inside], hit[inside]
     return Samples(hits // (n * n), hits % (n * n), hit, distance)
@@ -267,9 +274,9 @@ def expand(counts: Tensor) -> tuple[Tensor, Tensor]:
 def _candidates(cells, extent, origin, origins, frames, n, chunk):
     """Yield pairs spot·bricks + brick with rays spot·n² + ray that contain every ray through every brick.
 
-    A brick lies in a cone of half-angle α about its centre; the concentric map stretches by at most ``LIPSCHITZ``, so its rays
-    lie within ``LIPSCHITZ·α`` of the centre's coordinates in the square. A centre below the horizon is first moved to the
-    horizon's nearest point, which brings it closer to every ray.
+    A brick lies in a cone of half-angle α about its centre; the concentric map stretches by at most
+    ``LIPSCHITZ``, so its rays lie within ``LIPSCHITZ·α`` of the centre's coordinates in the square. A centre
+    below the horizon is first moved to the horizon's nearest point, which brings it closer to every ray.
     """
     centre = origin + (cells + 0.5) * extent
     radius = 0.5 * torch.linalg.vector_norm(extent)
@@ -301,7 +308,9 @@ def _candidates(cells, extent, origin, origins, frames, n, chunk):
 
 
 def _clip(box: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit distance of rays with ``inverse`` directions through boxes given by opposite corners; entry ≥ exit: a miss."""
+    """Entry and exit distance of rays with ``inverse`` directions through boxes given by opposite corners;
+    entry ≥ exit: a miss.
+    """
     one, two = box[:, :3] * inverse, box[:, 3:] * inverse
     return torch.minimum(one, two).amax(1), torch.maximum(one, two).amin(1)
 

@@ -1,8 +1,9 @@
 """Phasor-field imaging, Eq. 1-2 at t = 0: virtual illumination and Rayleigh-Sommerfeld propagation.
 
-The field at a voxel is ``u(x_v) = Σ_f w_f(Ω_pf, σ_pf) A_f(x_v)``. Only the weights ``w`` depend on what is optimised, so the
-propagated field ``A`` is computed once. The weights of all admissible (Ω_pf, σ_pf) span far fewer dimensions than there are
-frequencies (a virtual pulse of a few σ_pf is short against the transient), so ``A`` is stored in an orthonormal basis of that
+The field at a voxel is ``u(x_v) = Σ_f w_f(Ω_pf, σ_pf) A_f(x_v)``. Only the weights ``w`` depend on what is
+optimised, so the propagated field ``A`` is computed once. The weights of all admissible (Ω_pf, σ_pf) span far
+fewer dimensions than there are frequencies (a virtual pulse of a few σ_pf is short against the transient), so
+``A`` is stored in an orthonormal basis of that
 span: ``u = Σ_r (Bᵀw)_r (A B)_r``.
 """
 
@@ -32,12 +33,16 @@ RUN = 64  # rows that are summed in single precision
 
 
 def virtual_illumination(omega: Tensor, omega_pf: Tensor, sigma_pf: Tensor) -> Tensor:
-    """Spectrum of ``P(t) = e^{iΩ_pf t} e^{-t²/(2σ_pf²)}`` at frequencies ``omega`` ``[F]`` rad/m, scaled to a unit peak."""
+    """Spectrum of ``P(t) = e^{iΩ_pf t} e^{-t²/(2σ_pf²)}`` at frequencies ``omega`` ``[F]`` rad/m, scaled to a
+    unit peak.
+    """
     return torch.exp(-0.5 * ((omega - omega_pf) * sigma_pf) ** 2)
 
 
 def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
-    """``U[f, s] = Σ_t H[s, t] e^{iΩ_f t}``; counts ``[S, T]``, time of bin centres ``[T]`` m, omega ``[F]`` rad/m."""
+    """``U[f, s] = Σ_t H[s, t] e^{iΩ_f t}``; counts ``[S, T]``, time of bin centres ``[T]`` m, omega ``[F]``
+    rad/m.
+    """
     phase = omega.double().to(counts.device)[:, None] * time.double().to(counts.device)
     kernel = torch.polar(torch.ones_like(phase), phase).to(torch.complex64)
     real = counts.to(torch.float32).T.contiguous()
@@ -47,10 +52,11 @@ def spectrum(counts: Tensor, time: Tensor, omega: Tensor) -> Tensor:
 def frequencies(
     omega_bounds: tuple[float, float], sigma_min: float, period: float, cutoff: float = 3.0
 ) -> Tensor:
-    """``[F]`` rad/m, float64: multiples of 2π/period that carry the spectrum of every admissible virtual pulse.
+    """``[F]`` rad/m, float64: multiples of 2π/period that carry the spectrum of every admissible virtual
+    pulse.
 
-    Frequencies at and below zero are left out, although a pulse of few cycles has weight there. Against Eq. 2, which has
-    them, the volume changes by 1e-5 at σΩ = 5, 2e-4 at 4.6, 2 % at 3.4 and 13 % at 2.6.
+    Frequencies at and below zero are left out, although a pulse of few cycles has weight there. Against Eq.
+    2, which has them, the volume changes by 1e-5 at σΩ = 5, 2e-4 at 4.6, 2 % at 3.4 and 13 % at 2.6.
 
     Args:
         omega_bounds: smallest and largest Ω_pf, rad/m.
@@ -67,9 +73,11 @@ def frequencies(
 def weight_basis(
     omega: Tensor, omega_bounds: tuple[float, float], sigma_bounds: tuple[float, float], tolerance: float
 ) -> Tensor:
-    """Orthonormal ``[F, R]`` whose span holds every admissible spectrum within ``tolerance`` (relative, 2-norm).
+    """Orthonormal ``[F, R]`` whose span holds every admissible spectrum within ``tolerance`` (relative,
+    2-norm).
 
-    The family is sampled densely against its own width (a fifth of 1/σ in Ω), so what lies between the samples is in the span too.
+    The family is sampled densely against its own width (a fifth of 1/σ in Ω), so what lies between the
+    samples is in the span too.
     """
     sigmas = torch.exp(
         torch.linspace(math.log(sigma_bounds[0]), math.log(sigma_bounds[1]), 24, dtype=torch.float64)
@@ -101,7 +109,8 @@ def lattice_phasors(
     fixed: Tensor | None = None,
     voxel_origin: tuple[float, float] = (0.0, 0.0),
 ) -> Iterator[Tensor]:
-    """Propagate a planar aperture to planes parallel to it by linear (zero-padded) convolution, one plane at a time.
+    """Propagate a planar aperture to planes parallel to it by linear (zero-padded) convolution, one plane at
+    a time.
 
     Args:
         field: ``[L, F, nx, ny]`` complex spectrum on the aperture lattice; L = 1 but for exhaustive scans.
@@ -111,7 +120,8 @@ def lattice_phasors(
         offset: index of the first voxel column and row relative to the aperture's first point.
         shape: ``(mx, my)`` voxels of a plane.
         depth: ``[nz]`` distances of the planes from the aperture, m.
-        fixed: ``[L, 3]`` the other wall point of each of the L scans (relative to the aperture's plane), m; None when confocal.
+        fixed: ``[L, 3]`` the other wall point of each of the L scans (relative to the aperture's plane), m;
+            None when confocal.
         voxel_origin: x, y of voxel [0, 0] in the frame of ``fixed``, m.
 
     Yields:
@@ -208,7 +218,8 @@ def direct_phasors(
 
 
 def sum_of_rows(pull: Tensor, rows: Tensor) -> Tensor:
-    """``Σ_n pull[n] rows[n]`` ``[R]`` float64, at the speed of single precision: short runs are summed in it, these in double.
+    """``Σ_n pull[n] rows[n]`` ``[R]`` float64, at the speed of single precision: short runs are summed in it,
+    these in double.
 
     What Ω_pf gets of this sum is thousands of times smaller than the sum, so that its last digits count.
     """
@@ -218,10 +229,12 @@ def sum_of_rows(pull: Tensor, rows: Tensor) -> Tensor:
 
 
 class PhasorMagnitude(torch.autograd.Function):
-    """``|Σ_r w_r A[v, r]|`` for all voxels; the backward pass touches only the voxels that received a gradient.
+    """``|Σ_r w_r A[v, r]|`` for all voxels; the backward pass touches only the voxels that received a
+    gradient.
 
-    Inputs: basis field ``[V, 2, R]`` (any float type) and weights ``[R]``, whose gradient is summed in double precision; to be kept
-    they must be float64. Output ``[V]`` float32 (float64 from a float64 field), m⁻²-weighted counts.
+    Inputs: basis field ``[V, 2, R]`` (any float type) and weights ``[R]``, whose gradient is summed in double
+    precision; to be kept they must be float64. Output ``[V]`` float32 (float64 from a float64 field),
+    m⁻²-weighted counts.
     """
 
     @staticmethod

@@ -19,7 +19,8 @@ class Slabs:
     Args:
         planes: of the whole volume, at least one a process.
         rank: this process.
-        group: of the processes; collectives of their own, so that they keep out of the order of DistributedDataParallel's.
+        group: of the processes; collectives of their own, so that they keep out of the order of
+            DistributedDataParallel's.
     """
 
     planes: int
@@ -55,7 +56,9 @@ class Slabs:
         return most_planes(self.planes, self.ranks)
 
     def handed_over(self, plane: int) -> int:
-        """Bytes each process hands over in an iteration, with ``plane`` voxels a plane: its slab, and its gradient of all slabs."""
+        """Bytes each process hands over in an iteration, with ``plane`` voxels a plane: its slab, and its
+        gradient of all slabs.
+        """
         return 4 * plane * self.most * (1 + self.ranks)
 
 
@@ -76,8 +79,9 @@ def most_planes(planes: int, ranks: int) -> int:
 class GatherPlanes(torch.autograd.Function):
     """``[own planes, …]`` of every process → ``[planes, …]``, the same in all.
 
-    Backward each slab's owner gets the sum of what all processes' losses say about it, so that DistributedDataParallel's mean of
-    the gradients over processes is that of one process that holds everything.
+    Backward each slab's owner gets the sum of what all processes' losses say about it, so that
+    DistributedDataParallel's mean of the gradients over processes is that of one process that holds
+    everything.
     """
 
     @staticmethod
@@ -99,7 +103,8 @@ class GatherPlanes(torch.autograd.Function):
 
 
 def leave_buffers(module: nn.Module) -> None:
-    """Keep DistributedDataParallel from copying all buffers, the phasor field too, from the first process in every iteration.
+    """Keep DistributedDataParallel from copying all buffers, the phasor field too, from the first process in
+    every iteration.
 
     They never change once they are made, and a slab is its process's own.
     """

@@ -1,15 +1,21 @@
-"""Smooth functions of one or two coordinates in [-1, 1]: combinations of uniform cubic B-splines, ordered by their roughness."""
+"""Smooth functions of one or two coordinates in [-1, 1]: combinations of uniform cubic B-splines, ordered by
+their roughness.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-UNEVEN = 1.1  # slopes along the second axis weigh more: otherwise equal pairs of a square would mix at the eigensolver's whim
+# slopes along the second axis weigh more: otherwise equal pairs of a square would mix at the eigensolver's
+# whim
+UNEVEN = 1.1
 
 
 def spline_basis(u: Tensor, n: int) -> Tensor:
-    """``[S, n]`` values of n ≥ 4 uniform cubic B-splines at ``u`` ``[S]`` in [-1, 1]; they sum to one everywhere."""
+    """``[S, n]`` values of n ≥ 4 uniform cubic B-splines at ``u`` ``[S]`` in [-1, 1]; they sum to one
+    everywhere.
+    """
     pieces = n - 3
     place = ((u + 1) / 2 * pieces).clamp(0, pieces - 1e-5)
     first = place.floor().long()
@@ -21,10 +27,11 @@ def spline_basis(u: Tensor, n: int) -> Tensor:
 
 
 def smooth_basis(u: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Smooth functions of ``u`` ``[S]`` in [-1, 1], the smoothest first: ``[S, K ≤ n - 1]``, and their shares ``[K]``.
+    """Smooth functions of ``u`` ``[S]`` in [-1, 1], the smoothest first: ``[S, K ≤ n - 1]``, and their shares
+    ``[K]``.
 
-    Over the S points they average to zero with mean square 1; over the interval their slopes are orthogonal. The share of a
-    function is (first's mean squared slope)/(its own), the inverse square of its frequency.
+    Over the S points they average to zero with mean square 1; over the interval their slopes are orthogonal.
+    The share of a function is (first's mean squared slope)/(its own), the inverse square of its frequency.
     """
     mass, stiffness = _line_products(n)
     return _by_smoothness(spline_basis(u.double(), n), stiffness, mass, u.dtype)
@@ -51,7 +58,9 @@ def _line_products(n: int, points: int = 2001) -> tuple[Tensor, Tensor]:
 def _by_smoothness(
     basis: Tensor, stiffness: Tensor, mass: Tensor, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
-    """Combinations of the centred columns that are orthogonal over the points and in slope; those without points are dropped."""
+    """Combinations of the centred columns that are orthogonal over the points and in slope; those without
+    points are dropped.
+    """
     centred = basis - basis.mean(0)
     values, vectors = torch.linalg.eigh(stiffness + 1e-6 * mass)
     whiten = vectors * values.rsqrt()

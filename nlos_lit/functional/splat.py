@@ -19,8 +19,9 @@ def gaussian_splat(
 ) -> Tensor:
     """Scatter paths into ``[n_spots, n_bins]`` transients with the Gaussian of Sec. 4.3.
 
-    The paper's Gaussian has a unit peak, so its sum over bins depends on the sub-bin phase (±0.1 % at σ = 0.62, ±5.7 % at 0.425:
-    a false detector non-linearity). With ``normalise`` each path's weights are divided by their sum, which conserves energy.
+    The paper's Gaussian has a unit peak, so its sum over bins depends on the sub-bin phase (±0.1 % at σ =
+    0.62, ±5.7 % at 0.425: a false detector non-linearity). With ``normalise`` each path's weights are divided
+    by their sum, which conserves energy.
 
     Args:
         contribution: ``[K]`` energy of each path.
@@ -28,7 +29,8 @@ def gaussian_splat(
         spot: ``[K]`` row of each path.
         sigma: σ_t in bins.
 
-    Paths whose window leaves [0, n_bins) lose what lies outside, as light outside the recorded window is lost.
+    Paths whose window leaves [0, n_bins) lose what lies outside, as light outside the recorded window is
+    lost.
     """
     half = _half_width(sigma)
     offsets = torch.arange(-half, half + 1, device=time.device)

@@ -1,4 +1,6 @@
-"""The phasor product when the propagated field is larger than memory: it lies in a file and is read slab by slab."""
+"""The phasor product when the propagated field is larger than memory: it lies in a file and is read slab by
+slab.
+"""
 
 from __future__ import annotations
 

@@ -9,7 +9,8 @@ from torch import Tensor
 def neighbour_pairs(
     centre: Tensor, normal: Tensor, reach: float, agree: float = 0.3, chunk: int = 1024
 ) -> tuple[Tensor, Tensor]:
-    """Directed pairs (i, j) of surfels closer than ``reach`` to each other whose normals' cosine exceeds ``agree``.
+    """Directed pairs (i, j) of surfels closer than ``reach`` to each other whose normals' cosine exceeds
+    ``agree``.
 
     Args:
         centre: ``[M, 3]`` m. normal: ``[M, 3]`` unit. reach: m, or ``[M]`` for a reach of each first surfel.
@@ -35,13 +36,16 @@ def bending(
     crease: float = 0.5,
     stiffness: float = 0.05,
 ) -> Tensor:
-    """How badly neighbours fit one surface: ``Σ w r²/(1 + r²/c²)`` over pairs (Geman-McClure: an edge costs no more than c²).
+    """How badly neighbours fit one surface: ``Σ w r²/(1 + r²/c²)`` over pairs (Geman-McClure: an edge costs
+    no more than c²).
 
-    ``r² = (n̄·d)² + stiffness·|n_i - n_j|²/4``, n̄ the mean of the two normals, d the unit vector between the centres. On any arc of
-    constant curvature n̄·d = 0, so curved surfaces are not flattened, but normals cannot turn without the places following.
+    ``r² = (n̄·d)² + stiffness·|n_i - n_j|²/4``, n̄ the mean of the two normals, d the unit vector between the
+    centres. On any arc of constant curvature n̄·d = 0, so curved surfaces are not flattened, but normals
+    cannot turn without the places following.
 
     Args:
-        centre: ``[M, 3]`` m. normal: ``[M, 3]``. weight: ``[M]`` trust in each surfel; a pair counts their product. crease: c, rad.
+        centre: ``[M, 3]`` m. normal: ``[M, 3]``. weight: ``[M]`` trust in each surfel; a pair counts their
+            product. crease: c, rad.
     """
     i, j = pairs
     d = centre[j] - centre[i]
@@ -70,11 +74,12 @@ def clear_view(
 ) -> Tensor:
     """``[W, V]`` True where the straight line from a wall point to a target does not pierce the front sheet.
 
-    A line pierces the sheet where, between two samples in occupied cells, it goes from before it to behind it; lines that pass
-    behind a sheet's edge are clear.
+    A line pierces the sheet where, between two samples in occupied cells, it goes from before it to behind
+    it; lines that pass behind a sheet's edge are clear.
 
     Args:
-        sheet: ``[nx, ny]`` from :func:`front_sheet`. origin, pitch: ``[2]`` lateral centre of cell 0 and signed spacing, m.
+        sheet: ``[nx, ny]`` from :func:`front_sheet`. origin, pitch: ``[2]`` lateral centre of cell 0 and
+            signed spacing, m.
         wall: ``[W, 3]``. target: ``[V, 3]`` m.
         samples: along each line. skip: within this many cells of the target nothing hides it.
     """

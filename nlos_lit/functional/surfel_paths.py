@@ -1,7 +1,7 @@
 """Light paths over flat surface elements (surfels): throughput, length, and how they fill time bins.
 
-A surfel is a flat patch over a lateral cell, given by its centre and normal. Its path from the laser's wall point over the surfel
-to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
+A surfel is a flat patch over a lateral cell, given by its centre and normal. Its path from the laser's wall
+point over the surfel to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
 
     K = A cosθ1 cosθ2 cosθ3 cosθ4 / (d1² d2²)      at length d1 + d2,
 
@@ -42,8 +42,9 @@ def quadrature(n: int, device: torch.device | str = "cpu") -> Tensor:
 def spread(normal: Tensor, cell: Tensor, offsets: Tensor) -> tuple[Tensor, Tensor]:
     """Points of the patches relative to their centres, and areas.
 
-    A patch covers its lateral cell exactly while its normal is within ``acos(STEEP)`` of the z axis; a steeper one keeps the length
-    it has there and stands up in its own tangent plane, also beyond the vertical.
+    A patch covers its lateral cell exactly while its normal is within ``acos(STEEP)`` of the z axis; a
+    steeper one keeps the length it has there and stands up in its own tangent plane, also beyond the
+    vertical.
 
     Args:
         normal: ``[M, 3]`` unit, towards the wall's side. cell: ``[2]`` m. offsets: ``[Q, 2]``.
@@ -93,12 +94,15 @@ def trace(
 def _leg(
     points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]`` to the points."""
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]``
+    to the points.
+    """
     dx, dy, dz = (p - wall[:, k, None, None] for k, p in enumerate(points))
     square = dx * dx + dy * dy + dz * dz
     n = normal[:, :, None, None]
     at_wall = (n[:, 0] * dx + n[:, 1] * dy + n[:, 2] * dz).clamp_min(0)
-    # The points of one surfel lie in one plane, whose distance from the wall point is the same for all of them.
+    # The points of one surfel lie in one plane, whose distance from the wall point is the same for all of
+    # them.
     plane = -(
         facing[:, 0, None] * dx[..., :1] + facing[:, 1, None] * dy[..., :1] + facing[:, 2, None] * dz[..., :1]
     ).clamp_max(0)
@@ -109,8 +113,9 @@ def _leg(
 def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
     """Cubic B-spline shares of an arrival at ``time`` (bins; bin k is centred on k + ½).
 
-    They sum to one and have the right mean and variance ``SPLINE_VARIANCE`` at every sub-bin phase, so that shifting a
-    path by part of a bin neither makes nor loses light (de Boor, *A Practical Guide to Splines*, ch. IX).
+    They sum to one and have the right mean and variance ``SPLINE_VARIANCE`` at every sub-bin phase, so that
+    shifting a path by part of a bin neither makes nor loses light (de Boor, *A Practical Guide to Splines*,
+    ch. IX).
 
     Returns:
         first bin (long) of the shape of ``time``; weights ``[…, 4]`` of it and the three bins after.
@@ -132,9 +137,11 @@ def spline_slopes(time: Tensor) -> Tensor:
 
 
 class SplineSplat(torch.autograd.Function):
-    """``[B, T]`` transients from contributions ``[B, K]`` at times ``[B, K]`` (bins); what leaves [0, T) is lost.
+    """``[B, T]`` transients from contributions ``[B, K]`` at times ``[B, K]`` (bins); what leaves [0, T) is
+    lost.
 
-    Written out because autograd through the composed operations takes three times as long and ten times the memory.
+    Written out because autograd through the composed operations takes three times as long and ten times the
+    memory.
     """
 
     @staticmethod
@@ -174,7 +181,9 @@ class SplineSplat(torch.autograd.Function):
 
 
 def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
-    """``[B, n_bins]``: ``values`` ``[B, …, 4]`` added to the bins ``first … first + 3``; what lies outside is lost."""
+    """``[B, n_bins]``: ``values`` ``[B, …, 4]`` added to the bins ``first … first + 3``; what lies outside is
+    lost.
+    """
     bins = first.reshape(len(first), -1)[..., None] + torch.arange(4, device=first.device)
     values = values.reshape(bins.shape)
     inside = (bins >= 0) & (bins < n_bins)
@@ -185,7 +194,9 @@ def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
 
 
 def gather_bins(image: Tensor, time: Tensor) -> Tensor:
-    """``[B, K, 4]`` values of ``image`` ``[B, T]`` in the four bins that an arrival at ``time`` ``[B, K]`` fills; 0 outside."""
+    """``[B, K, 4]`` values of ``image`` ``[B, T]`` in the four bins that an arrival at ``time`` ``[B, K]``
+    fills; 0 outside.
+    """
     n_bins = image.shape[1]
     padded = torch.nn.functional.pad(image, (4, 4)).reshape(-1)
     first, _ = spline_weights(time.clamp(-2.0, n_bins + 2.0))

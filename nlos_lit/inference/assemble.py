@@ -1,4 +1,6 @@
-"""From the loop's findings to a :class:`~nlos_lit.inference.result.Diagnosis`: numbers, intervals, and plain statements."""
+"""From the loop's findings to a :class:`~nlos_lit.inference.result.Diagnosis`: numbers, intervals, and plain
+statements.
+"""
 
 from __future__ import annotations
 
@@ -148,8 +150,8 @@ def _of_another_form(form: Form) -> str:
 def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
     """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain.
 
-    A map that was taken back because it follows the count rate says so itself; another effect of the wrong form only where nothing
-    else does.
+    A map that was taken back because it follows the count rate says so itself; another effect of the wrong
+    form only where nothing else does.
     """
     rest = [
         d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain
@@ -169,8 +171,9 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
 
 
 def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: CriticismSettings) -> bool:
-    """Whether names hold less than the share ``explained`` of the misfit: of all that they gain and is left, nats a spot; or, where
-    most of what they were predicted to gain was of this very kind, of what the base had of it.
+    """Whether names hold less than the share ``explained`` of the misfit: of all that they gain and is left,
+    nats a spot; or, where most of what they were predicted to gain was of this very kind, of what the base
+    had of it.
     """
     if not found.accepted:
         return False
@@ -186,7 +189,9 @@ def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: Criti
 
 
 def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
-    """Whether a rebuild with the effects is likelier than the base without them: else it got stuck, and says nothing of them."""
+    """Whether a rebuild with the effects is likelier than the base without them: else it got stuck, and says
+    nothing of them.
+    """
     with_, without = (float(log_likelihood(fit, split.select).sum()) for fit in (again, base))
     return with_ > without
 

@@ -23,7 +23,8 @@ from nlos_lit.surfels.refine import refine
 class BasePipeline:
     """From counts to fitted surfels; picklable, so that toys can go through all of it in other processes.
 
-    ``volume``: arguments of :func:`~nlos_lit.capture.volume_grid.volume_grid`. ``budget``: bytes for the phasor field.
+    ``volume``: arguments of :func:`~nlos_lit.capture.volume_grid.volume_grid`. ``budget``: bytes for the
+    phasor field.
     """
 
     volume: Mapping[str, Any]

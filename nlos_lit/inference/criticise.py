@@ -1,4 +1,6 @@
-"""Show, name, extend, measure: the loop that finds out which physical effects a capture asks for (docs/criticism.md)."""
+"""Show, name, extend, measure: the loop that finds out which physical effects a capture asks for
+(docs/criticism.md).
+"""
 
 from __future__ import annotations
 
@@ -40,18 +42,22 @@ class CriticismSettings:
         spots: fitted spots that score tests look at at most (fewer where there are very many surfels).
         level: largest p-value, Holm-adjusted over all effects.
         least_gain: nats that the score test must predict …
-        least_shape: … for effects that neither move nor scale the light: of these the base's own errors feign fewer …
-        least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller may be the base's own.
-        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is rebuilt from new seeds;
-            the one that was screened best is always among them.
+        least_shape: … for effects that neither move nor scale the light: of these the base's own errors feign
+            fewer …
+        least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller
+            may be the base's own.
+        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is
+            rebuilt from new seeds; the one that was screened best is always among them.
         hopeless: share of the best predicted gain below which an effect is no rival.
         far_off: misfit over noise from which on single-path effects are finalists whatever their score.
         similar: correlation of projected sensitivities from which on two effects are one group.
         steps: batches of a refit (and as many again at falling rate).
         most: effects that are accepted at most.
-        explained: share of the structured misfit that named effects must explain; below it, the misfit is called unexplained.
+        explained: share of the structured misfit that named effects must explain; below it, the misfit is
+            called unexplained.
         numerics: vary seed and quadrature of the base, too.
-        toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on side by side.
+        toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
+            side by side.
     """
 
     spots: int = 1024
@@ -74,7 +80,8 @@ class CriticismSettings:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without another effect.
+    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without
+    another effect.
 
     ``form``: of the effect that was accepted before, where it is wrong.
     """
@@ -89,7 +96,9 @@ class Turn:
 
 
 def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
-    """How many fitted spots score tests look at, ``most`` or as many as ``WORK`` products allow; gains are nats over these."""
+    """How many fitted spots score tests look at, ``most`` or as many as ``WORK`` products allow; gains are
+    nats over these.
+    """
     columns = 2 * len(fit.model) + 64
     return min(most, len(split.fit), max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
 
@@ -110,7 +119,8 @@ def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[
 class Look:
     """Effects and flexible discrepancies as the score tests see them.
 
-    ``own`` ``[P]``: the step that the base alone would take. ``form``: of the effect asked about, where it is wrong.
+    ``own`` ``[P]``: the step that the base alone would take. ``form``: of the effect asked about, where it is
+    wrong.
     """
 
     candidates: list[Candidate]
@@ -120,7 +130,9 @@ class Look:
 
 
 def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, latest: str = "") -> Look:
-    """Screen all effects that the fit does not have yet, and the flexible discrepancies; look at the form of ``latest``."""
+    """Screen all effects that the fit does not have yet, and the flexible discrepancies; look at the form of
+    ``latest``.
+    """
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
     projector = Projector(problem)
@@ -155,10 +167,12 @@ def turn(
 ) -> Turn:
     """Screen, refit the rivals, rebuild the scene with the finalists, choose.
 
-    The control goes through the same without another effect (as it is, refitted, or rebuilt with another random seed).
+    The control goes through the same without another effect (as it is, refitted, or rebuilt with another
+    random seed).
 
-    Where the base is far off, linear tests around it say little about effects that bend single paths: these are rebuilt with, too.
-    Else, where a function of the count rate says more than any effect, the counting is none that the registry knows: no rivals.
+    Where the base is far off, linear tests around it say little about effects that bend single paths: these
+    are rebuilt with, too. Else, where a function of the count rate says more than any effect, the counting is
+    none that the registry knows: no rivals.
     """
     number = len(fit.extension.effects) + 1
     steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
@@ -244,10 +258,12 @@ def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
 
 
 def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: bool = False) -> float:
-    """Nats over the tested spots that an effect must promise, or gain once the scene is ``rebuilt``; ``over``: the misfit there.
+    """Nats over the tested spots that an effect must promise, or gain once the scene is ``rebuilt``;
+    ``over``: the misfit there.
 
-    A base that has not quite converged is off along what it could imitate, and what is left of an effect takes that for its own:
-    nats in inverse proportion to the retained information. Below ``WELL`` the rebuilt scene must gain as much more.
+    A base that has not quite converged is off along what it could imitate, and what is left of an effect
+    takes that for its own: nats in inverse proportion to the retained information. Below ``WELL`` the rebuilt
+    scene must gain as much more.
     """
     least = s.least_gain if candidate.effect.moves_light else s.least_shape
     scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) if rebuilt else 1.0
@@ -275,7 +291,9 @@ def significant(candidates: list[Candidate], s: CriticismSettings, over: float) 
 
 @dataclass
 class Findings:
-    """What the loop leaves behind: the base, every turn, the final extended fit, and the same ``again`` from new seeds."""
+    """What the loop leaves behind: the base, every turn, the final extended fit, and the same ``again`` from
+    new seeds.
+    """
 
     base: SurfelFit
     final: SurfelFit
@@ -311,8 +329,8 @@ def criticise(
 
     Args:
         base: fitted to ``split.fit`` without effects.
-        rebuild: a fit from new seeds with the given effects, begun at their present values, and the given random seed: surfels that
-            imitated an effect do not come back.
+        rebuild: a fit from new seeds with the given effects, begun at their present values, and the given
+            random seed: surfels that imitated an effect do not come back.
         steps: says and keeps what is done.
     """
     fit = before = base

@@ -41,12 +41,13 @@ def diagnose(
     Args:
         capture: raw counts; nothing else about the measurement is known.
         image: ``[nz, nx, ny]`` and its grid, where a run has made it already.
-        folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same arguments goes on; needed
-            with ``options.toys``.
+        folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same
+            arguments goes on; needed with ``options.toys``.
         settings, report: see :class:`~nlos_lit.runtime.steps.Steps`.
 
     Raises:
-        UserError: the scan is too small to be split, the capture holds no counts but expectations, or no surface is found.
+        UserError: the scan is too small to be split, the capture holds no counts but expectations, or no
+            surface is found.
     """
     began = time.perf_counter()
     if not capture.is_counts:

@@ -1,9 +1,11 @@
-"""Flexible discrepancies: may say that something is wrong along an axis, never what (after Kennedy and O'Hagan, 2001).
+"""Flexible discrepancies: may say that something is wrong along an axis, never what (after Kennedy and
+O'Hagan, 2001).
 
-Each axis has its own columns: the expected counts within one band of the axis. Along wall and scan there is one more set for every
-effect with one random number a spot that the counts ask for: that number, the same within a band. So an object that moves during
-the scan shows as a delay that is smooth along it, and not as jitter. All are tested like effects, projected off the base and all
-accepted effects, and cross-validated over random spots.
+Each axis has its own columns: the expected counts within one band of the axis. Along wall and scan there is
+one more set for every effect with one random number a spot that the counts ask for: that number, the same
+within a band. So an object that moves during the scan shows as a delay that is smooth along it, and not as
+jitter. All are tested like effects, projected off the base and all accepted effects, and cross-validated over
+random spots.
 """
 
 from __future__ import annotations
@@ -23,12 +25,16 @@ from nlos_lit.inference.screen import FOLDS, Projector
 
 BANDS = {"time": 40, "wall": 8, "scan": 64, "rate": 10}
 RETAINED = 1e-3  # share of a combination's information that the base must leave
-SMOOTH = 0.5  # share of a per-spot effect's gain that neighbours have in common, from which on its numbers are not independent
+# share of a per-spot effect's gain that neighbours have in common, from which on its numbers are not
+# independent
+SMOOTH = 0.5
 
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """``gain`` nats (cross-validated); ``statistic`` of ``degrees`` columns; ``of``: the per-spot effect smoothed, or ""."""
+    """``gain`` nats (cross-validated); ``statistic`` of ``degrees`` columns; ``of``: the per-spot effect
+    smoothed, or "".
+    """
 
     axis: str
     gain: float
@@ -43,7 +49,8 @@ def discrepancies(
 ) -> list[Discrepancy]:
     """One for each axis, and two for each per-spot effect; the largest gain first.
 
-    Stretches of a raster are stripes of the wall: a map of the wall that holds nothing beyond the order of the scan is left out.
+    Stretches of a raster are stripes of the wall: a map of the wall that holds nothing beyond the order of
+    the scan is left out.
     """
     root = problem.expected.sqrt()
     asked = {"": (root, tuple(BANDS))}
@@ -61,12 +68,16 @@ def discrepancies(
 
 
 def smooth(found: list[Discrepancy], name: str, gain: float) -> bool:
-    """Whether neighbours share much of what a per-spot effect gains (nats), so that its numbers are not independent."""
+    """Whether neighbours share much of what a per-spot effect gains (nats), so that its numbers are not
+    independent.
+    """
     return any(d.of == name and d.gain > SMOOTH * gain for d in found)
 
 
 def counted(found: list[Discrepancy]) -> float:
-    """Nats that a function of the count rate gains; of an effect of the registry it never holds as much as the effect itself."""
+    """Nats that a function of the count rate gains; of an effect of the registry it never holds as much as
+    the effect itself.
+    """
     return next(d.gain for d in found if d.axis == "rate")
 
 
@@ -97,9 +108,11 @@ def _test(
 
 
 def flexible(columns: Tensor, problem: Problem, projector: Projector) -> tuple[float, float, int, float]:
-    """Gain (nats, cross-validated over random spots), statistic, degrees and p-value of weighted columns ``[S, T, k]``.
+    """Gain (nats, cross-validated over random spots), statistic, degrees and p-value of weighted columns
+    ``[S, T, k]``.
 
-    Combinations that the base can imitate (``RETAINED``) are left out: their scores and information are rounding errors.
+    Combinations that the base can imitate (``RETAINED``) are left out: their scores and information are
+    rounding errors.
     """
     spots, bins, k = columns.shape
     raw = columns.reshape(-1, k)

@@ -1,11 +1,13 @@
 """Does what an effect explains have the effect's own form?
 
-An effect's equation says that one strength holds everywhere. Once it is in the model, its change Δμ of the expected counts is cut
-into bands of the time axis that weigh the same, and each may ask for a strength of its own. A ripple that was accepted for a gap in
-the time codes wants four times the strength at the gap, and none elsewhere.
+An effect's equation says that one strength holds everywhere. Once it is in the model, its change Δμ of the
+expected counts is cut into bands of the time axis that weigh the same, and each may ask for a strength of its
+own. A ripple that was accepted for a gap in the time codes wants four times the strength at the gap, and none
+elsewhere.
 
-A smooth map over wall or scan knows nothing of the hidden scene. One that falls with the scene's own light at each spot belongs to
-the counting: a detector that saturates looks like a wall that is dark wherever the scene is bright.
+A smooth map over wall or scan knows nothing of the hidden scene. One that falls with the scene's own light at
+each spot belongs to the counting: a detector that saturates looks like a wall that is dark wherever the scene
+is bright.
 """
 
 from __future__ import annotations
@@ -35,9 +37,10 @@ POWERS, DRAWS = 2, 4000  # of the logarithm of the count rate; of random maps
 class Form:
     """How far an accepted effect is from its own form.
 
-    ``own``: nats that the effect's own change is worth, ½‖Δμ/√μ‖². ``gain``: along time, nats that strengths of its own in every
-    band bring beyond the common one, cross-validated over random spots; where the base leaves Δμ alone, gain/own is the relative
-    mean square by which the strength varies. Along rate, nats of ``own`` that a falling function of the count rate makes.
+    ``own``: nats that the effect's own change is worth, ½‖Δμ/√μ‖². ``gain``: along time, nats that strengths
+    of its own in every band bring beyond the common one, cross-validated over random spots; where the base
+    leaves Δμ alone, gain/own is the relative mean square by which the strength varies. Along rate, nats of
+    ``own`` that a falling function of the count rate makes.
     """
 
     name: str
@@ -49,7 +52,9 @@ class Form:
 
     @property
     def wrong(self) -> bool:
-        """The strength varies by more than 70 % (root mean square) of itself, or 85 % of the map follow the count rate."""
+        """The strength varies by more than 70 % (root mean square) of itself, or 85 % of the map follow the
+        count rate.
+        """
         share, level = LIMITS[self.axis]
         return self.p_value < level and self.gain > share * self.own
 
@@ -78,7 +83,8 @@ def _over_time(problem: Problem, projector: Projector, effect: Effect, change: T
 
 @torch.no_grad()
 def _over_rate(problem: Problem, effect: SmoothEffect, change: Tensor, rate: Tensor) -> Form:
-    """Only maps that fall as the rate grows count: no detector sees better for more light, but a wall is lit most where a scene is.
+    """Only maps that fall as the rate grows count: no detector sees better for more light, but a wall is lit
+    most where a scene is.
 
     Args:
         change: ``[S, T]`` Δμ/√μ. rate: ``[S]`` counts without the effect.

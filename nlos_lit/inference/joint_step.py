@@ -1,7 +1,7 @@
 """One Gauss–Newton step of effects and base together, as the screening's columns ask for it.
 
-An effect that the base has imitated can only come in while the imitation goes: with little retained information, an effect's step
-by itself makes the fit worse.
+An effect that the base has imitated can only come in while the imitation goes: with little retained
+information, an effect's step by itself makes the fit worse.
 """
 
 from __future__ import annotations
@@ -32,7 +32,9 @@ def set_step(effect: Effect, step: Tensor) -> None:
 
 @torch.no_grad()
 def move_base(fit: SurfelFit, present: Extension, step: Tensor) -> None:
-    """Move surfels, response and the ``present`` effects by nuisance coefficients ``[P]`` in the order of the columns."""
+    """Move surfels, response and the ``present`` effects by nuisance coefficients ``[P]`` in the order of the
+    columns.
+    """
     model = fit.model
     m, fields = len(model), tilt_fields(model)
     sizes = (m, m, fields.shape[1], fields.shape[1])
@@ -61,7 +63,9 @@ def _add(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
 
 @torch.no_grad()
 def shift(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
-    """Add the first numbers of ``step`` to the stored values, without regard to bounds; the numbers that are left."""
+    """Add the first numbers of ``step`` to the stored values, without regard to bounds; the numbers that are
+    left.
+    """
     for p in effect.amplitudes + (effect.shapes if shapes else []):
         getattr(effect, f"raw_{p.name}").add_(step[: p.size])
         step = step[p.size :]
@@ -71,12 +75,12 @@ def shift(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
 def best_start(
     fit: SurfelFit, extra: list[Effect], steps: list[Tensor], beside: Tensor | None, seed: int
 ) -> SurfelFit:
-    """A copy of the fit with ``extra`` effects, begun where the tested spots are likeliest: steps of the effects with the base left
-    alone, or joint steps of several lengths.
+    """A copy of the fit with ``extra`` effects, begun where the tested spots are likeliest: steps of the
+    effects with the base left alone, or joint steps of several lengths.
 
     Args:
-        steps: ``[k]`` of each extra effect's stored amplitudes. beside: ``[P]`` what the base does at the same time, None for
-            nothing.
+        steps: ``[k]`` of each extra effect's stored amplitudes. beside: ``[P]`` what the base does at the
+            same time, None for nothing.
     """
 
     def begun(length: float, moved: Tensor | None) -> SurfelFit:

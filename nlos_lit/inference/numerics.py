@@ -24,7 +24,8 @@ def numerics(
     seed: int,
     other: SurfelFit | None = None,
 ) -> dict[str, float]:
-    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted surfels.
+    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted
+    surfels.
 
     ``other``: a fit with another seed, where there is one.
     """

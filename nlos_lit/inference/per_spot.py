@@ -1,8 +1,9 @@
-"""Effects with one random number a spot: nothing can be predicted for a spot that was not measured, but its scatter can.
+"""Effects with one random number a spot: nothing can be predicted for a spot that was not measured, but its
+scatter can.
 
-A spot's coefficient δ is drawn from N(0, σ²), with probability π where it is sparse and positive (half normal), else always. With
-the spot's own score s and information F the marginal likelihood over δ is, up to what does not depend on σ (Laplace; exact for
-Gaussian counts),
+A spot's coefficient δ is drawn from N(0, σ²), with probability π where it is sparse and positive (half
+normal), else always. With the spot's own score s and information F the marginal likelihood over δ is, up to
+what does not depend on σ (Laplace; exact for Gaussian counts),
 
     ln[(1 - π) + π exp(½ σ²s²/(1 + σ²F)) / √(1 + σ²F)]
 
@@ -43,7 +44,9 @@ def factors(score: Tensor, information: Tensor, width: float, share: float, posi
 
 
 def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[float, float, float]:
-    """Gain (nats), width and share that maximise the marginal likelihood; gain 0 where nothing does better than none."""
+    """Gain (nats), width and share that maximise the marginal likelihood; gain 0 where nothing does better
+    than none.
+    """
     typical = float(information.median().clamp_min(1e-30).rsqrt())
     best = (0.0, 0.0, 1.0)
     for k in torch.arange(-6, 13, 0.5).tolist():
@@ -76,7 +79,9 @@ def coefficients(score: Tensor, information: Tensor, width: float, positive: boo
 def spot_scores(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Score and information ``[S]`` of each spot's own coefficient at its present value, and expected counts ``[S, T]``."""
+    """Score and information ``[S]`` of each spot's own coefficient at its present value, and expected counts
+    ``[S, T]``.
+    """
     with torch.no_grad():
         expected = model.expected(spots, extension).double().clamp_min(1e-6)
     column = effect_columns(model, extension, spots, effect).view(expected.shape).double()
@@ -87,7 +92,9 @@ def spot_scores(
 def solve(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor, rounds: int = 4
 ) -> None:
-    """Set the coefficients of ``spots`` to their posterior means by Newton steps, the width re-estimated from their scatter."""
+    """Set the coefficients of ``spots`` to their posterior means by Newton steps, the width re-estimated from
+    their scatter.
+    """
     p = effect.amplitudes[0]
     raw = getattr(effect, f"raw_{p.name}")
     for _ in range(rounds):

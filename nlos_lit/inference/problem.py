@@ -1,9 +1,11 @@
-"""How the expected counts answer to everything that is, or could be, in the model: columns of one weighted least-squares problem.
+"""How the expected counts answer to everything that is, or could be, in the model: columns of one weighted
+least-squares problem.
 
-Rows are gated bins of the looked-at spots, divided by √μ, so that counts of the model itself have unit variance.
+Rows are gated bins of the looked-at spots, divided by √μ, so that counts of the model itself have unit
+variance.
 
-- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, smooth tilts of all normals, the
-  laser-sensor response, and the parameters of effects that were accepted before.
+- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, smooth tilts of all
+  normals, the laser-sensor response, and the parameters of effects that were accepted before.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
@@ -37,7 +39,8 @@ class Problem:
     Args:
         spots: ``[S]``, one row block of ``bins`` rows each. expected: ``[S, bins]`` μ.
         nuisance: ``[S·bins, P]`` X. prior: ``[P]`` precision of each nuisance column's coefficient.
-        residual: ``[S·bins]``. transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
+        residual: ``[S·bins]``. transients: ``[S, T]`` light on arrival, which response, spot and counting
+            effects start from.
     """
 
     model: SurfelModel
@@ -101,10 +104,11 @@ def effect_columns(
     shapes: bool = False,
     transients: Tensor | None = None,
 ) -> Tensor:
-    """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the extension.
+    """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the
+    extension.
 
-    ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every spot's own.
-    ``transients``: ``[S, T]`` of these spots, where they are known already.
+    ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every
+    spot's own. ``transients``: ``[S, T]`` of these spots, where they are known already.
     """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
@@ -168,7 +172,9 @@ def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor
 def _staged(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None
 ) -> _Forward:
-    """The part of the forward model that comes after what ``effect`` cannot change, with the part before worked out."""
+    """The part of the forward model that comes after what ``effect`` cannot change, with the part before
+    worked out.
+    """
     if effect.needs_paths:
         paths = model.paths(spots)
         return _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
@@ -207,7 +213,9 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 
 @torch.no_grad()
 def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor) -> Tensor:
-    """``[B, T, 2M + 2F]`` derivatives of the transients by albedos (in units of themselves), depths (in bins) and tilts."""
+    """``[B, T, 2M + 2F]`` derivatives of the transients by albedos (in units of themselves), depths (in bins)
+    and tilts.
+    """
     centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
     unit = albedo_unit(albedo)
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])

@@ -20,7 +20,9 @@ BOOTSTRAP = 400
 
 @dataclass(frozen=True)
 class Comparison:
-    """Gain of one model over another, nats, with the standard error and 95 % interval by bootstrap over wall blocks."""
+    """Gain of one model over another, nats, with the standard error and 95 % interval by bootstrap over wall
+    blocks.
+    """
 
     nats: float
     error: float
@@ -32,7 +34,8 @@ def refit_with(
 ) -> SurfelFit:
     """Warm-started joint refit with more effects (none: the control), begun at their one-step estimates.
 
-    ``beside`` ``[P]``: what the base does at the same time; None takes that of a single candidate, and nothing for several.
+    ``beside`` ``[P]``: what the base does at the same time; None takes that of a single candidate, and
+    nothing for several.
     """
     if beside is None and len(candidates) == 1:
         beside = candidates[0].beside
@@ -48,7 +51,9 @@ def refit_with(
 
 
 def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
-    """``[S]`` Poisson log-likelihood of each spot that was not fitted (without ln k!), marginal over per-spot effects."""
+    """``[S]`` Poisson log-likelihood of each spot that was not fitted (without ln k!), marginal over per-spot
+    effects.
+    """
     index = torch.from_numpy(spots)
     first, last = fit.capture.gate
     counts = torch.from_numpy(fit.capture.counts[spots, first:last].astype(np.float64))

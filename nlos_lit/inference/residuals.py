@@ -1,4 +1,6 @@
-"""Where the counts leave the model: signed significance of the residual along time, depth, wall, scan order and count rate."""
+"""Where the counts leave the model: signed significance of the residual along time, depth, wall, scan order
+and count rate.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ SIDE = 16
 def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> list[Profile]:
     """Residuals of ``spots`` ``[S]`` summed over bands of each axis, in standard deviations of their counts.
 
-    NaN where a band has no spots. The wall's edges are metres in the world frame; depth is left out where nothing has one.
+    NaN where a band has no spots. The wall's edges are metres in the world frame; depth is left out where
+    nothing has one.
     """
     first, last = scan.gate
     counts = torch.from_numpy(before.capture.counts[spots.numpy(), first:last].astype(np.float32))

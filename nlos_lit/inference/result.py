@@ -20,7 +20,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Gain:
-    """What an effect brings on spots it was not fitted to; ``ci95`` of ``nats_per_photon``, by block bootstrap."""
+    """What an effect brings on spots it was not fitted to; ``ci95`` of ``nats_per_photon``, by block
+    bootstrap.
+    """
 
     deviance_per_bin_before: float
     deviance_per_bin_after: float
@@ -45,9 +47,10 @@ class Accepted:
 class Screened:
     """One effect's score test at its null, against the base.
 
-    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters, ``shape`` the
-    scanned ones; ``detectable`` is the smallest amplitude of each parameter that this capture would reveal (statistic 25).
-    ``expected``: statistic without the effect, on average: degrees of freedom, or what toys show where that is more.
+    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters,
+    ``shape`` the scanned ones; ``detectable`` is the smallest amplitude of each parameter that this capture
+    would reveal (statistic 25). ``expected``: statistic without the effect, on average: degrees of freedom,
+    or what toys show where that is more.
     """
 
     name: str
@@ -86,7 +89,8 @@ class Scores:
 class Profile:
     """Signed residual significance along one axis, before and after the extension.
 
-    ``edges`` ``[K + 1]`` in ``unit``, ``before`` and ``after`` ``[K]`` (K1 × K2 for the wall, with ``edges`` of both sides).
+    ``edges`` ``[K + 1]`` in ``unit``, ``before`` and ``after`` ``[K]`` (K1 × K2 for the wall, with ``edges``
+    of both sides).
     """
 
     axis: str

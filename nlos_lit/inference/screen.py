@@ -1,13 +1,15 @@
-"""Score tests of every effect at its null, without a refit: which would explain the residual, after all the base can do itself?
+"""Score tests of every effect at its null, without a refit: which would explain the residual, after all the
+base can do itself?
 
-With weighted columns ``X`` (nuisance), ``Z`` (effect) and residual ``r`` (:mod:`nlos_lit.inference.problem`), projected off the
-nuisance, ``Z⊥ = Z - X(XᵀX + Λ)⁻¹XᵀZ`` and ``r⊥`` likewise:
+With weighted columns ``X`` (nuisance), ``Z`` (effect) and residual ``r`` (:mod:`nlos_lit.inference.problem`),
+projected off the nuisance, ``Z⊥ = Z - X(XᵀX + Λ)⁻¹XᵀZ`` and ``r⊥`` likewise:
 
     score s = Z⊥ᵀ r⊥,  information F = Z⊥ᵀ Z⊥,  statistic sᵀ F⁻¹ s,  one-step estimate F⁻¹ s.
 
-The *predicted gain* is cross-validated over wall blocks: θ from all other blocks, its gain θᵀs_b - ½ θᵀF_bθ in nats on block b. It
-weighs effects with one and with thirty coefficients on the same scale, and misfit that is not the effect's does not transfer.
-(C. R. Rao's score test; the projection is the efficient score, e.g. van der Vaart, *Asymptotic Statistics*, ch. 25.)
+The *predicted gain* is cross-validated over wall blocks: θ from all other blocks, its gain θᵀs_b - ½ θᵀF_bθ
+in nats on block b. It weighs effects with one and with thirty coefficients on the same scale, and misfit that
+is not the effect's does not transfer. (C. R. Rao's score test; the projection is the efficient score, e.g.
+van der Vaart, *Asymptotic Statistics*, ch. 25.)
 """
 
 from __future__ import annotations
@@ -34,9 +36,10 @@ PRIOR_SCALES = (1.0, 0.25)  # of the deviations of priors on coefficients
 class Candidate:
     """One effect (at its best shape) as the score test sees it.
 
-    ``gain`` nats, cross-validated; ``step`` ``[k]`` one-step change of the stored amplitudes; ``direction`` ``[N]`` unit vector:
-    what the step changes, projected off the nuisance, for comparison with rivals. ``beside`` ``[P]``: what the base does at the
-    same time, coefficients of the nuisance columns; None where that is not known.
+    ``gain`` nats, cross-validated; ``step`` ``[k]`` one-step change of the stored amplitudes; ``direction``
+    ``[N]`` unit vector: what the step changes, projected off the nuisance, for comparison with rivals.
+    ``beside`` ``[P]``: what the base does at the same time, coefficients of the nuisance columns; None where
+    that is not known.
     """
 
     effect: Effect
@@ -89,7 +92,9 @@ class Projector:
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
-    """``xᵀx`` ``[P, P]`` with little more than half of its multiplications, which are most of a screening's work."""
+    """``xᵀx`` ``[P, P]`` with little more than half of its multiplications, which are most of a screening's
+    work.
+    """
     gram = x.new_empty(x.shape[1], x.shape[1])
     for start in range(0, x.shape[1], block):
         part = x[:, start:].T @ x[:, start : start + block]
@@ -102,7 +107,8 @@ def screen(problem: Problem, projector: Projector, effects: list[Effect], folds:
     """Test every effect; the largest predicted gain first.
 
     Args:
-        effects: at their nulls. folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block belongs to.
+        effects: at their nulls. folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block
+            belongs to.
     """
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
     others = (e for e in effects if not e.per_spot)
@@ -120,7 +126,9 @@ def screen(problem: Problem, projector: Projector, effects: list[Effect], folds:
 
 
 def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
-    """Effects whose columns are projected together: a projection passes over all nuisance columns, however few it projects."""
+    """Effects whose columns are projected together: a projection passes over all nuisance columns, however
+    few it projects.
+    """
     group, width = [], 0
     for effect, kept in tried:
         group.append((effect, kept))
@@ -172,7 +180,8 @@ def _score(
             known = total + floor + torch.diag(prior / scale**2)
             step = torch.linalg.solve(known, s.sum(0)).clamp(lower, upper)
             free = torch.linalg.solve(total + floor, s.sum(0)).clamp(lower, upper)
-            # Bounds may spoil a free step whose coefficients balance one another: the held-back one then says more.
+            # Bounds may spoil a free step whose coefficients balance one another: the held-back one then says
+            # more.
             statistic = max(0.0, *(float(2 * t @ s.sum(0) - t @ total @ t) for t in (free, step)))
             retained = float(torch.linalg.solve(whole + floor, total).diagonal().mean())
             p = min(1.0, len(shapes) * float(stats.chi2.sf(statistic, k)))
@@ -201,8 +210,8 @@ def _worthwhile(
 ) -> list[tuple[dict[str, float], Tensor]]:
     """The ``KEPT`` most promising shapes with their columns.
 
-    Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what costs. So shapes are
-    ranked by the score over the unprojected information.
+    Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what
+    costs. So shapes are ranked by the score over the unprojected information.
     """
     shapes, ranked = effect.shape_grid(), []
     for shape in shapes:

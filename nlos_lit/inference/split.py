@@ -32,9 +32,11 @@ class Split:
 
 
 def split_spots(capture: Capture, blocks: int = 8) -> Split:
-    """About ``blocks × blocks`` contiguous patches of the wall: five eighths to fit, a quarter to select, an eighth untouched.
+    """About ``blocks × blocks`` contiguous patches of the wall: five eighths to fit, a quarter to select, an
+    eighth untouched.
 
-    Contiguous, because random spots leak through their neighbours. Spots without a single gated count were not measured.
+    Contiguous, because random spots leak through their neighbours. Spots without a single gated count were
+    not measured.
 
     Raises:
         UserError: a role is left without spots.

@@ -1,9 +1,10 @@
-"""The null distribution by toys: draw counts from the fitted base, go through the whole pipeline again, screen again.
+"""The null distribution by toys: draw counts from the fitted base, go through the whole pipeline again,
+screen again.
 
-What the pipeline itself does to a capture without effects (seeds, surfels that stay or die, an optimiser that stops) then counts as
-noise. A statistic is judged against a gamma distribution with the mean and variance of its toys, and against χ²: the larger p
-counts. On a bright capture a base leaves something like a slow tail every time, 190 ± 65 where χ² expects 1: no stretched χ² is
-so narrow.
+What the pipeline itself does to a capture without effects (seeds, surfels that stay or die, an optimiser that
+stops) then counts as noise. A statistic is judged against a gamma distribution with the mean and variance of
+its toys, and against χ²: the larger p counts. On a bright capture a base leaves something like a slow tail
+every time, 190 ± 65 where χ² expects 1: no stretched χ² is so narrow.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ Pipeline = Callable[[Capture, Split, int], SurfelFit]
 
 @dataclass(frozen=True)
 class Null:
-    """``moments``: mean and variance of each effect's statistic. ``largest``: largest predicted gain of each toy."""
+    """``moments``: mean and variance of each effect's statistic. ``largest``: largest predicted gain of each
+    toy.
+    """
 
     toys: int
     moments: dict[str, tuple[float, float]]
@@ -46,7 +49,8 @@ class Null:
         return max(float(candidate.degrees), self.moments.get(candidate.effect.name, (0.0, 0.0))[0])
 
     def p_value(self, candidate: Candidate) -> float:
-        """Of the gamma distribution or of χ², whichever is larger. A toy's statistic is that of its best shape, too.
+        """Of the gamma distribution or of χ², whichever is larger. A toy's statistic is that of its best
+        shape, too.
 
         Fewer toys than ``FEW`` do not settle a variance: it is then at least that of a χ² with the same mean.
         """

@@ -16,8 +16,8 @@ from nlos_lit.surfels.fit import SurfelFit
 class Trial:
     """One rival after its refit: its gain on the select spots over a control that was refitted without it.
 
-    ``predicted``: nats that the screening predicts, cross-validated, for the fitted spots. Both gains are of spots that had no part
-    in the parameters, so that they add up to one piece of evidence.
+    ``predicted``: nats that the screening predicts, cross-validated, for the fitted spots. Both gains are of
+    spots that had no part in the parameters, so that they add up to one piece of evidence.
     """
 
     candidate: Candidate
@@ -45,14 +45,18 @@ def best_of_each(trials: list[Trial]) -> list[Trial]:
 
 
 def choose(trials: list[Trial], block: np.ndarray) -> Trial:
-    """The best rival, or the one with fewest parameters among those that cannot be told from it (one standard error)."""
+    """The best rival, or the one with fewest parameters among those that cannot be told from it (one standard
+    error).
+    """
     best = trials[0]
     near = [t for t in trials if t is best or _short(t, best, block, errors=1)]
     return min(near, key=lambda t: (t.candidate.degrees, -t.evidence))
 
 
 def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float) -> list[str]:
-    """Names that this capture cannot tell from the best: as much evidence, or the same sensitivity and nearly as much."""
+    """Names that this capture cannot tell from the best: as much evidence, or the same sensitivity and nearly
+    as much.
+    """
     names = []
     for other in trials:
         if other is best:
@@ -64,6 +68,8 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float
 
 
 def _short(trial: Trial, best: Trial, block: np.ndarray, errors: float) -> bool:
-    """Whether a trial falls short of the best by less than so many errors (of the select spots), or by next to nothing."""
+    """Whether a trial falls short of the best by less than so many errors (of the select spots), or by next
+    to nothing.
+    """
     short = compare(trial.likelihood, best.likelihood, block)
     return short.nats + best.predicted - trial.predicted < max(errors * short.error, 0.02 * best.evidence)

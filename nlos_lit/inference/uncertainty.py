@@ -21,8 +21,8 @@ REACH = 3.0  # standard errors over which quantities are displaced
 class Uncertainty:
     """Joint covariance of all parameters of all effects, the base projected off.
 
-    The larger of two: F⁻¹ (counts alone) and F⁻¹(Σ_b s_b s_bᵀ)F⁻¹ (scatter of the score between wall blocks, which also feels
-    misfit; Huber's sandwich).
+    The larger of two: F⁻¹ (counts alone) and F⁻¹(Σ_b s_b s_bᵀ)F⁻¹ (scatter of the score between wall blocks,
+    which also feels misfit; Huber's sandwich).
 
     Args:
         spots: ``[S]`` fitted spots that are looked at, with gated ``counts`` and wall ``block``.
@@ -54,9 +54,10 @@ class Uncertainty:
     def parameters(self, effect: Effect, again: Effect | None = None) -> dict[str, Estimate]:
         """Reported quantities and their errors. The width of per-spot effects: from the number of spots.
 
-        An error is a third of the change over three standard errors along each axis of the covariance, the larger of both ways, in
-        quadrature: the delta method where a quantity is linear, and more where it bends, as the length of a vector does whose
-        largest component is not settled. ``again``: the same effect in a fit from new seeds; the difference is an error, too.
+        An error is a third of the change over three standard errors along each axis of the covariance, the
+        larger of both ways, in quadrature: the delta method where a quantity is linear, and more where it
+        bends, as the length of a vector does whose largest component is not settled. ``again``: the same
+        effect in a fit from new seeds; the difference is an error, too.
         """
         if effect.per_spot:
             return _spread(effect, self.fitted)
@@ -93,7 +94,9 @@ def e_size(effect: Effect) -> int:
 
 
 def _spread(effect: Effect, share: float) -> dict[str, Estimate]:
-    """Of a per-spot effect, from the spots that have a number; ``share`` of all spots were fitted. Numbers of spots are for all."""
+    """Of a per-spot effect, from the spots that have a number; ``share`` of all spots were fitted. Numbers of
+    spots are for all.
+    """
     known = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
     found = {}
     for name, (quantity, unit, spots) in effect.quantities().items():

@@ -22,7 +22,9 @@ SLOW = (
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
-    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None without the pulse."""
+    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None
+    without the pulse.
+    """
     first = capture.gate[0]
     before = capture.counts[:, :first].sum(1, dtype=np.float64)
     if first == 0 or before.mean() < LEAST or not capture.confocal:
@@ -61,10 +63,11 @@ def log_gain(fit: SurfelFit, n_spots: int) -> np.ndarray | None:
 
 
 def direct_decays(capture: Capture) -> list[float] | None:
-    """Decay lengths (m) of the mean direct pulse, early and late: fits of an exponential to two stretches behind its peak.
+    """Decay lengths (m) of the mean direct pulse, early and late: fits of an exponential to two stretches
+    behind its peak.
 
-    The level before the gate's start is taken as background. Early is from 1/20 to 1/200 of the peak, late the rest down to three
-    times the background.
+    The level before the gate's start is taken as background. Early is from 1/20 to 1/200 of the peak, late
+    the rest down to three times the background.
     """
     mean = capture.counts[:, : capture.gate[0]].mean(0, dtype=np.float64)
     peak = int(mean.argmax())

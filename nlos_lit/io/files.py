@@ -1,6 +1,7 @@
 """Results on disk: volumes (HDF5), points (PLY), meshes (PLY) and JSON.
 
-Every writer fills a hidden file beside its target and renames it: an interrupt leaves the old file or none, never half a file.
+Every writer fills a hidden file beside its target and renames it: an interrupt leaves the old file or none,
+never half a file.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ import numpy as np
 
 @contextlib.contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
-    """Yields a path of the target's suffix to write to; it becomes ``path`` when the block ends well, else it vanishes."""
+    """Yields a path of the target's suffix to write to; it becomes ``path`` when the block ends well, else it
+    vanishes.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
@@ -31,7 +34,9 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
 
 def write_json(path: Path | str, data: Any) -> None:
-    """Strict JSON, two spaces deep; dataclasses, arrays and NumPy numbers become plain values, NaN and infinities become null."""
+    """Strict JSON, two spaces deep; dataclasses, arrays and NumPy numbers become plain values, NaN and
+    infinities become null.
+    """
     text = json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False)
     with whole_file(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")

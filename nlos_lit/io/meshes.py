@@ -1,4 +1,6 @@
-"""A triangle mesh through the reconstructed points: Poisson surface reconstruction (Kazhdan and Hoppe 2013) by Open3D."""
+"""A triangle mesh through the reconstructed points: Poisson surface reconstruction (Kazhdan and Hoppe 2013)
+by Open3D.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +32,18 @@ class MeshReport:
 def poisson_mesh(
     points: Points, depth: int = 8, trim: float = 1.5
 ) -> tuple[open3d.geometry.TriangleMesh | None, MeshReport]:
-    """Poisson surface through oriented points, grey by albedo, without what the method invents where there are no points.
+    """Poisson surface through oriented points, grey by albedo, without what the method invents where there
+    are no points.
 
-    Poisson surfaces are closed: behind an open surface they bulge away from the data. The lowest so many per cent of the sampling
-    density do not single that out (the bulge held 6 to 26 % of the vertices in examples), the distance to the points does.
+    Poisson surfaces are closed: behind an open surface they bulge away from the data. The lowest so many per
+    cent of the sampling density do not single that out (the bulge held 6 to 26 % of the vertices in
+    examples), the distance to the points does.
 
     Args:
         points: at least 50 distinct ones; normals decide inside and outside.
         depth: octree depth; the finest cell is 2^-depth of the points' extent.
-        trim: vertices farther from every point than this many typical spacings (median distance to the 6th neighbour) go.
+        trim: vertices farther from every point than this many typical spacings (median distance to the 6th
+            neighbour) go.
 
     Returns:
         The mesh and its report; None and the reason where there is nothing to mesh, which is no error.

@@ -32,7 +32,8 @@ class Points:
         intensity: ``[N]`` phasor intensity at the point, where known.
 
     Raises:
-        ValueError: shapes disagree, values are NaN or infinite, or normals are not unit vectors (within 1e-3).
+        ValueError: shapes disagree, values are NaN or infinite, or normals are not unit vectors (within
+            1e-3).
     """
 
     positions: np.ndarray
@@ -64,7 +65,9 @@ class Points:
 
 
 def write_points(path: Path | str, points: Points) -> None:
-    """Binary PLY with position (m), normal, ``albedo`` and ``intensity`` as floats, and a grey colour for viewers."""
+    """Binary PLY with position (m), normal, ``albedo`` and ``intensity`` as floats, and a grey colour for
+    viewers.
+    """
     columns = {name: points.positions[:, k] for k, name in enumerate(AXES)}
     columns |= {f"n{name}": points.normals[:, k] for k, name in enumerate(AXES)}
     columns["albedo"] = points.albedo

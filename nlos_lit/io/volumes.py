@@ -17,7 +17,8 @@ AXES = ("x", "y", "z")
 def write_volume(
     path: Path | str, values: np.ndarray, grid: VolumeGrid, **extra_datasets: np.ndarray
 ) -> None:
-    """HDF5 with ``volume`` [nz, nx, ny] float32, its axes ``x``, ``y``, ``z`` in metres, and a dataset for each extra volume.
+    """HDF5 with ``volume`` [nz, nx, ny] float32, its axes ``x``, ``y``, ``z`` in metres, and a dataset for
+    each extra volume.
 
     Raises:
         ValueError: ``values`` or an extra volume is not of the grid's shape.

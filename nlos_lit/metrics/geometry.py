@@ -11,16 +11,17 @@ from scipy.spatial import cKDTree
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.io.points import Points
 
-STEEPEST = 4.0  # depth change per lattice cell, in cells, above which two cells are two surfaces and are not interpolated
+# depth change per lattice cell, in cells, above which two cells are two surfaces and are not interpolated
+STEEPEST = 4.0
 
 
 @dataclass(frozen=True)
 class GeometryErrors:
     """Lengths in metres, angles in degrees, shares in 0 … 1; NaN where nothing could be compared.
 
-    ``compared`` of ``points`` have true surface at their (x, y); depth and normal errors are over those. ``depth_bias`` is the mean
-    of estimate minus truth. ``coverage`` is the share of true cells with an estimated point near them, ``off_truth`` the share of
-    estimated points with no true cell near them.
+    ``compared`` of ``points`` have true surface at their (x, y); depth and normal errors are over those.
+    ``depth_bias`` is the mean of estimate minus truth. ``coverage`` is the share of true cells with an
+    estimated point near them, ``off_truth`` the share of estimated points with no true cell near them.
     """
 
     points: int
@@ -53,10 +54,11 @@ def geometry_errors(
         points: the reconstruction.
         truth: the surface, in the same frame.
         depth_tolerance: a point and a cell are near each other within this depth, m …
-        lateral_tolerance: … and within this distance in x and in y, m; None means one cell of the truth. Give the reconstruction's
-            own point spacing where it is coarser, or coverage measures the spacing.
-        regions: two boolean ``[nx, ny]`` masks A and B; the albedo ratio is mean(A) / mean(B), over the estimated points that are
-            near the truth and whose nearest cell is in the region. Needs ``truth.albedo``.
+        lateral_tolerance: … and within this distance in x and in y, m; None means one cell of the truth. Give
+            the reconstruction's own point spacing where it is coarser, or coverage measures the spacing.
+        regions: two boolean ``[nx, ny]`` masks A and B; the albedo ratio is mean(A) / mean(B), over the
+            estimated points that are near the truth and whose nearest cell is in the region. Needs
+            ``truth.albedo``.
     """
     lateral = max(truth.cell) if lateral_tolerance is None else lateral_tolerance
     near_cells, near_points = _neighbours(points.positions, truth, lateral, depth_tolerance)
@@ -89,11 +91,12 @@ def geometry_errors(
 def depth_at(truth: SurfaceTruth, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """True depth at ``xy`` [N, 2], and the nearest cell.
 
-    Bilinear inside a smooth piece of surface; the nearest cell's depth at rims and across depth steps, where interpolation would
-    invent a surface between two.
+    Bilinear inside a smooth piece of surface; the nearest cell's depth at rims and across depth steps, where
+    interpolation would invent a surface between two.
 
     Returns:
-        ``[N]`` depth, NaN beside the surface and the lattice; ``[N, 2]`` indices of the nearest cell, clipped to the lattice.
+        ``[N]`` depth, NaN beside the surface and the lattice; ``[N, 2]`` indices of the nearest cell, clipped
+        to the lattice.
     """
     shape = np.array(truth.depth.shape)
     place = (np.asarray(xy, dtype=np.float64) - [truth.x[0], truth.y[0]]) / truth.cell
@@ -114,7 +117,9 @@ def depth_at(truth: SurfaceTruth, xy: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def depth_map(points: Points, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """``[nx, ny]`` median depth of the points in each cell of an evenly spaced lattice; NaN where there are none."""
+    """``[nx, ny]`` median depth of the points in each cell of an evenly spaced lattice; NaN where there are
+    none.
+    """
     centres = (np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
     place = np.stack([(points.positions[:, k] - c[0]) / (c[1] - c[0]) for k, c in enumerate(centres)])
     i, j = np.floor(place + 0.5).astype(np.int64)
@@ -131,7 +136,9 @@ def depth_map(points: Points, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def _neighbours(
     positions: np.ndarray, truth: SurfaceTruth, lateral: float, depth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Whether each true cell has a point, and each point a true cell, in the box ±lateral, ±lateral, ±depth around it."""
+    """Whether each true cell has a point, and each point a true cell, in the box ±lateral, ±lateral, ±depth
+    around it.
+    """
     i, j = np.nonzero(np.isfinite(truth.depth))
     scale = np.array([lateral, lateral, depth]) * (1 + 1e-9)
     cells = np.stack([truth.x[i], truth.y[j], truth.depth[i, j]], axis=1).astype(np.float64) / scale

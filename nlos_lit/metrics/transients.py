@@ -27,9 +27,11 @@ def poisson_deviance(counts: Tensor, expected: Tensor) -> Tensor:
 
 
 def expected_deviance(expected: Tensor, terms: int = 60) -> Tensor:
-    """Mean over all bins of the Poisson deviance that counts drawn from ``expected`` itself would have: the level of pure noise.
+    """Mean over all bins of the Poisson deviance that counts drawn from ``expected`` itself would have: the
+    level of pure noise.
 
-    ``2 E[k ln(k/μ)]``, summed over k < ``terms`` on a table in ln μ for μ < 20 (error below 1e-4), 1 + 1/(6μ) + 1/(6μ²) beyond.
+    ``2 E[k ln(k/μ)]``, summed over k < ``terms`` on a table in ln μ for μ < 20 (error below 1e-4), 1 + 1/(6μ)
+    + 1/(6μ²) beyond.
     """
     mu = torch.exp(torch.linspace(math.log(1e-6), math.log(20.0), 2000, dtype=torch.float64))
     k = torch.arange(terms, dtype=torch.float64)[:, None]

@@ -9,7 +9,9 @@ from torch import Tensor, nn
 
 
 class FreeAlbedo(nn.Module):
-    """Albedo in (0, 1) stored per voxel without regard to the intensity, as the paper writes it: ``ρ = sigmoid(raw)``."""
+    """Albedo in (0, 1) stored per voxel without regard to the intensity, as the paper writes it: ``ρ =
+    sigmoid(raw)``.
+    """
 
     def __init__(self, shape: tuple[int, int, int], initial: float) -> None:
         super().__init__()
@@ -20,7 +22,9 @@ class FreeAlbedo(nn.Module):
 
 
 class ResidualAlbedo(nn.Module):
-    """Albedo as the paper's code stores it: ``ρ = clamp(mask·(I_pf + δ), 0, 1)``, δ ∈ ±0.2 from 0, mask where I_pf > threshold."""
+    """Albedo as the paper's code stores it: ``ρ = clamp(mask·(I_pf + δ), 0, 1)``, δ ∈ ±0.2 from 0, mask where
+    I_pf > threshold.
+    """
 
     def __init__(self, shape: tuple[int, int, int], threshold: float, span: float = 0.2) -> None:
         super().__init__()

@@ -68,7 +68,8 @@ class PipelineSettings:
 
 
 def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSettings) -> Pipeline:
-    """Submodules with start values as in the paper and its code; call ``pipeline.phasor.prepare`` and ``match_energy`` next.
+    """Submodules with start values as in the paper and its code; call ``pipeline.phasor.prepare`` and
+    ``match_energy`` next.
 
     Raises:
         UserError: a setting is impossible.
@@ -154,7 +155,9 @@ def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
 
 
 def estimate_background(capture: Capture) -> float:
-    """Counts per bin that are there without the scene: the lowest mean over a sixteenth of the gate, all spots together."""
+    """Counts per bin that are there without the scene: the lowest mean over a sixteenth of the gate, all
+    spots together.
+    """
     mean = capture.gated_counts().mean(axis=0, dtype=np.float64)
     width = max(1, len(mean) // 16)
     smooth = np.convolve(mean, np.ones(width) / width, mode="valid")

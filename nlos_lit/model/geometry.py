@@ -1,4 +1,6 @@
-"""Implicit surface geometry G = D(I_pf) (Sec. 4.2): points and normals seen from each wall point, without a mesh."""
+"""Implicit surface geometry G = D(I_pf) (Sec. 4.2): points and normals seen from each wall point, without a
+mesh.
+"""
 
 from __future__ import annotations
 
@@ -38,10 +40,11 @@ class ImplicitGeometry(nn.Module):
         beta: sharpness of the softargmax.
         fine: samples a step around the largest sample; 1 keeps the paper's one sample a bin, whose depth is
             quantised to half a bin.
-        relative: β applies to intensities relative to the ray's largest, so that weak surfaces are located as sharply as
-            strong ones; False applies it to the intensities themselves, as the paper does.
-        static: march with tensors of fixed size, so that a GPU never waits for the host; None does so on accelerators.
-            Needs ``fine > 1``: the samples that the paper's softargmax looks at can be any number.
+        relative: β applies to intensities relative to the ray's largest, so that weak surfaces are located as
+            sharply as strong ones; False applies it to the intensities themselves, as the paper does.
+        static: march with tensors of fixed size, so that a GPU never waits for the host; None does so on
+            accelerators. Needs ``fine > 1``: the samples that the paper's softargmax looks at can be any
+            number.
     """
 
     def __init__(
@@ -100,7 +103,8 @@ class ImplicitGeometry(nn.Module):
         return wanted and self.fine > 1
 
     def renew_capacity(self) -> bool:
-        """Make room for half as much again as was needed since the last call; True if there was too little, so rays were lost.
+        """Make room for half as much again as was needed since the last call; True if there was too little,
+        so rays were lost.
 
         Waits for the device; does nothing on a CPU.
         """
@@ -145,7 +149,9 @@ class ImplicitGeometry(nn.Module):
         )
 
     def _places(self, samples: Samples, origins: Tensor, direction: Tensor) -> Tensor:
-        """``[M, 3]`` float64 samples at whole half steps along hit rays: β multiplies every rounding of a place by a thousand."""
+        """``[M, 3]`` float64 samples at whole half steps along hit rays: β multiplies every rounding of a
+        place by a thousand.
+        """
         unit = self.step / (2 * self.fine)
         at = torch.empty(len(samples.hit), 3, dtype=torch.float64, device=origins.device)
         for hit, distance, rows in zip(
@@ -165,14 +171,17 @@ class ImplicitGeometry(nn.Module):
         direction: Tensor,
         static: StaticSamples | None = None,
     ) -> Tensor:
-        """``Σ ω_i d_i / Σ ω_i`` with ``ω_i = e^{β I_i}`` per hit ray ``[K]``; of ``static`` samples those that mean something."""
+        """``Σ ω_i d_i / Σ ω_i`` with ``ω_i = e^{β I_i}`` per hit ray ``[K]``; of ``static`` samples those
+        that mean something.
+        """
         hits = samples.spot.shape[0]
         value = trilinear(intensity, self._places(samples, origins, direction), self.lattice)
         if static is not None:
             value = torch.where(
                 static.used[:, None], torch.where(static.inside, value.view_as(static.inside), 0.0), 1.0
             ).view(-1)
-        # With a relative β the largest intensity scales the exponent, so the gradient passes through it; otherwise it cancels.
+        # With a relative β the largest intensity scales the exponent, so the gradient passes through it;
+        # otherwise it cancels.
         largest = value if self.relative else value.detach()
         top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(
             0, samples.hit, largest, "amax"
@@ -193,9 +202,9 @@ class ImplicitGeometry(nn.Module):
         """Unit normals ``[K, 3]`` and which hits have one.
 
         The paper sums the normals of the triangles N-E-S and S-W-N of the neighbouring rays' points, which is
-        ``(E - W) × (S - N)``. A neighbour that met no surface is replaced by the point itself (a one-sided difference);
-        a hit without any neighbour along one of the two directions has no normal and is treated as no surface. Rows that are not
-        ``used`` are nobody's neighbours.
+        ``(E - W) × (S - N)``. A neighbour that met no surface is replaced by the point itself (a one-sided
+        difference); a hit without any neighbour along one of the two directions has no normal and is treated
+        as no surface. Rows that are not ``used`` are nobody's neighbours.
         """
         n = self.side
         rays = n_spots * n * n

@@ -20,8 +20,9 @@ class LaserSensor(nn.Module):
         n_bins: bins of the transients; the kernel reaches that far behind the arrival at most.
         sigma_ls: joint laser and jitter width, m of path. kappa_s: decay rate, 1/m of path.
         intensity: I_l, counts per unit of H_r. background: η_s, counts per bin.
-        splat_sigma: width of the renderer's splat in bins. When given, its variance is taken out of Ψ, so that σ_ls is the
-            physical width; then σ_ls cannot be smaller than the splat. None applies Ψ on top of the splat, as the paper does.
+        splat_sigma: width of the renderer's splat in bins. When given, its variance is taken out of Ψ, so
+            that σ_ls is the physical width; then σ_ls cannot be smaller than the splat. None applies Ψ on top
+            of the splat, as the paper does.
     """
 
     def __init__(

@@ -17,7 +17,8 @@ class Objective(NamedTuple):
     Args:
         scale: counts that the loss counts as 1.
         lambda_sparsity, lambda_albedo: λ1 and λ2.
-        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes all.
+        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes
+            all.
         seed: of the batches of voxels.
     """
 
@@ -28,7 +29,9 @@ class Objective(NamedTuple):
     seed: int = 0
 
     def terms(self, pipeline: Pipeline, spots: Tensor, counts: Tensor, step: int) -> dict[str, Tensor]:
-        """Loss terms and their sum over a batch: ``spots`` ``[S]``, gated ``counts`` ``[S, T]``, number of the iteration."""
+        """Loss terms and their sum over a batch: ``spots`` ``[S]``, gated ``counts`` ``[S, T]``, number of
+        the iteration.
+        """
         rendering = pipeline(spots)
         terms = {"transient": transient_loss(counts / self.scale, rendering.expected / self.scale)}
         terms |= self.regularisation(rendering.intensity, self.voxel_batch(rendering.albedo, step))
@@ -68,7 +71,9 @@ def adam(pipeline: Pipeline, rates: dict[str, float], optimised: list[str]) -> t
 
 
 def communicated_bytes(pipeline: Pipeline) -> int:
-    """What each process of a distributed run hands over in an iteration: gradients and, where the field is shared, its volume's."""
+    """What each process of a distributed run hands over in an iteration: gradients and, where the field is
+    shared, its volume's.
+    """
     gradients = sum(
         p.numel() * p.element_size() for group in parameter_groups(pipeline).values() for p in group
     )

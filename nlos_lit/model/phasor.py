@@ -1,4 +1,6 @@
-"""Phasor imaging (Sec. 3.1, 4.1): transients → volumetric intensity I_pf, differentiable in Θ_pf = {Ω_pf, σ_pf}."""
+"""Phasor imaging (Sec. 3.1, 4.1): transients → volumetric intensity I_pf, differentiable in Θ_pf = {Ω_pf,
+σ_pf}.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +72,9 @@ class LatticeLayout:
     padded_points: int  # of the zero-padded transform
 
     def plane_bytes(self, n_freq: int, rank: int) -> int:
-        """Working memory of one plane: kernel spectra of all frequencies when confocal, else what is summed over them."""
+        """Working memory of one plane: kernel spectra of all frequencies when confocal, else what is summed
+        over them.
+        """
         quarter = self.padded_points // 4 if self.geometry.fixed is None else 0
         return 8 * n_freq * quarter + 8 * rank * self.padded_points * 3
 
@@ -112,14 +116,16 @@ class PhasorImaging(nn.Module):
         self.register_buffer("gain", gain[:, None, None], persistent=False)
 
     def plan(self, capture: Capture, memory_budget: int, shards: int = 1) -> PhasorPlan:
-        """Frequencies, rank, precision, place and bytes for this capture: single precision in memory, half, or single on disk.
+        """Frequencies, rank, precision, place and bytes for this capture: single precision in memory, half,
+        or single on disk.
 
         Args:
             memory_budget: bytes, of one process.
             shards: processes that share the depth planes.
 
         Raises:
-            MemoryBudgetError: not even what propagates the field fits ``memory_budget`` bytes, or the disk is too small.
+            MemoryBudgetError: not even what propagates the field fits ``memory_budget`` bytes, or the disk is
+                too small.
             UserError: more ``shards`` than depth planes.
         """
         omega = self._frequencies(capture)
@@ -174,7 +180,8 @@ class PhasorImaging(nn.Module):
         spots: np.ndarray | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]`` (or its file).
+        """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]`` (or
+        its file).
 
         Of a plan for several processes each calls this and propagates the voxels of its own planes.
 
@@ -210,7 +217,9 @@ class PhasorImaging(nn.Module):
         self.field = field
 
     def forward(self) -> Tensor:
-        """``[nz, nx, ny]`` intensity with a unit maximum; all processes that share the field call it together."""
+        """``[nz, nx, ny]`` intensity with a unit maximum; all processes that share the field call it
+        together.
+        """
         if self.image is not None and not torch.is_grad_enabled():
             return self.image
         weights = F.virtual_illumination(self.omega, self.omega_pf(), self.sigma_pf())
@@ -229,7 +238,8 @@ class PhasorImaging(nn.Module):
     def hold(self) -> None:
         """Keep the volume as it is now for all that asks for it without gradients until :meth:`release`.
 
-        All processes that share the field call this together; after that each may look at the volume as often as it likes.
+        All processes that share the field call this together; after that each may look at the volume as often
+        as it likes.
         """
         self.image = None
         self.image = self()
@@ -262,7 +272,9 @@ class PhasorImaging(nn.Module):
         return F.spectrum(counts, time, self.omega)
 
     def _layout(self, capture: Capture) -> LatticeLayout | None:
-        """How the voxels lie on the scan's lattice; None where they or the spots do not, and the direct sum is needed."""
+        """How the voxels lie on the scan's lattice; None where they or the spots do not, and the direct sum
+        is needed.
+        """
         geometry = scan_geometry(capture)
         if geometry is None:
             return None

@@ -28,7 +28,9 @@ class Rendering(NamedTuple):
 
 
 class Pipeline(nn.Module):
-    """Phasor imaging, implicit geometry, transient rendering and laser-sensor response over one capture's wall points."""
+    """Phasor imaging, implicit geometry, transient rendering and laser-sensor response over one capture's
+    wall points.
+    """
 
     def __init__(
         self,
@@ -60,7 +62,9 @@ class Pipeline(nn.Module):
         )
 
     def surface(self, intensity: Tensor, sensor: Tensor, normal: Tensor) -> Surface:
-        """The surface seen from each of ``sensor`` ``[S, 3]``; points that occur several times are marched from once."""
+        """The surface seen from each of ``sensor`` ``[S, 3]``; points that occur several times are marched
+        from once.
+        """
         if self.geometry.static:  # without asking the device which points are equal
             return (
                 self._from_one(intensity, sensor, normal)
@@ -85,7 +89,9 @@ class Pipeline(nn.Module):
         return Surface(spot, *(field.repeat(spots, *[1] * (field.dim() - 1)) for field in seen[1:]))
 
     def render(self, intensity: Tensor, albedo: Tensor, spots: Tensor) -> tuple[Tensor, Surface, Tensor]:
-        """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given volume."""
+        """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given
+        volume.
+        """
         laser, sensor = self.laser[spots], self.sensor[spots]
         surface = self.surface(intensity, sensor, self.sensor_normal[spots])
         surface_albedo = trilinear(albedo, surface.point, self.geometry.lattice)

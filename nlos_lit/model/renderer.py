@@ -1,4 +1,6 @@
-"""Transient rendering of the implicit surface (Sec. 3.2, 4.3, Eq. 5-9): third-bounce paths laser → x_g → sensor."""
+"""Transient rendering of the implicit surface (Sec. 3.2, 4.3, Eq. 5-9): third-bounce paths laser → x_g →
+sensor.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,10 @@ from nlos_lit.model.geometry import Surface
 class TransientRenderer(nn.Module):
     """Surface points and albedo → transients H_r ``[S, T]`` before the laser-sensor response.
 
-    A ray of solid angle ``dω = 2π/n²`` from the sensor's wall point meets the area ``dω d_gs²/cosθ_3``, so Eq. 8 integrated over
-    that area is ``K = ρ cosθ_1 cosθ_2 cosθ_4 / d_lg² · dω``: the inverse square and the cosine on the sensor's leg cancel
-    exactly. The constant ρ_w²/π³ of radiometry is part of the laser intensity I_l.
+    A ray of solid angle ``dω = 2π/n²`` from the sensor's wall point meets the area ``dω d_gs²/cosθ_3``, so
+    Eq. 8 integrated over that area is ``K = ρ cosθ_1 cosθ_2 cosθ_4 / d_lg² · dω``: the inverse square and the
+    cosine on the sensor's leg cancel exactly. The constant ρ_w²/π³ of radiometry is part of the laser
+    intensity I_l.
 
     Args:
         n_bins: T; bin_length, t_start: of the capture, m.
@@ -64,7 +67,9 @@ class TransientRenderer(nn.Module):
 
 
 def throughput(surface: Surface, laser: Tensor, laser_normal: Tensor, sensor_normal: Tensor) -> Tensor:
-    """``cosθ_1 cosθ_2 cosθ_4 / d_lg²`` per path ``[K]``, 1/m²; absolute cosines as in Eq. 6, wall points per path ``[K, 3]``."""
+    """``cosθ_1 cosθ_2 cosθ_4 / d_lg²`` per path ``[K]``, 1/m²; absolute cosines as in Eq. 6, wall points per
+    path ``[K, 3]``.
+    """
     ray = surface.point - laser
     leg = torch.linalg.vector_norm(ray, dim=1)
     unit = ray / leg[:, None]

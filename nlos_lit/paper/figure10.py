@@ -48,7 +48,9 @@ def trainings(work: Workspace, size: Size, subject: Subject) -> dict[str, Path]:
 
 
 def figure10(work: Workspace, size: Size) -> Evidence:
-    """A mesh by Poisson reconstruction for every system, RMSE and Hausdorff distance from it to the truth and back."""
+    """A mesh by Poisson reconstruction for every system, RMSE and Hausdorff distance from it to the truth and
+    back.
+    """
     rows: list[Row] = []
     clouds, labels, glance = [], [], []
     for subject in [bunny(work, size), *with_geometry(work, size)]:

@@ -25,7 +25,9 @@ SHOWN = {
 
 
 def signal_to_noise(scene: Scene) -> float:
-    """10 log₁₀ of Σ signal² / Σ variance over the gated bins, dB: signal² estimated from counts as (n - b)² - n, variance as n."""
+    """10 log₁₀ of Σ signal² / Σ variance over the gated bins, dB: signal² estimated from counts as (n - b)² -
+    n, variance as n.
+    """
     counts = scene.capture.gated_counts().astype(np.float64)
     background = BACKGROUND * (counts.sum() / scene.capture.n_spots) / (1 + BACKGROUND * counts.shape[1])
     power = ((counts - background) ** 2 - counts).sum()

@@ -97,7 +97,9 @@ def figure7(work: Workspace, size: Size) -> Evidence:
 
 
 def consensus(fronts: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Masks of letters and of background from the mean of several images' amplitudes, each relative to its 99th percentile."""
+    """Masks of letters and of background from the mean of several images' amplitudes, each relative to its
+    99th percentile.
+    """
     mean = np.mean([np.clip(np.sqrt(f) / np.quantile(np.sqrt(f), 0.99), 0, 1) for f in fronts], axis=0)
     return mean > ON, mean <= np.quantile(mean, DARK)
 

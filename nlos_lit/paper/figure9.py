@@ -85,7 +85,9 @@ def _of_points(points: Points, values: np.ndarray, x: np.ndarray, y: np.ndarray)
 
 
 def cell_median(points: Points, values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """``[nx, ny]`` median of ``values`` ``[N]`` over the points in each cell of a lattice; NaN where there are none."""
+    """``[nx, ny]`` median of ``values`` ``[N]`` over the points in each cell of a lattice; NaN where there
+    are none.
+    """
     carried = Points(np.column_stack([points.positions[:, :2], values]), points.normals, points.albedo)
     return depth_map(carried, x, y)
 

@@ -1,4 +1,6 @@
-"""Surfaces of all systems on one capture: the classical ones with the best settings found by hand, ours as they come."""
+"""Surfaces of all systems on one capture: the classical ones with the best settings found by hand, ours as
+they come.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,17 @@ def possible(scene: Scene) -> list[str]:
 
 
 def options_of(method: str, scene: Scene, snrs: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Option sets to try: the falloff as the scene has it, the signal-to-noise parameter swept where there is one."""
+    """Option sets to try: the falloff as the scene has it, the signal-to-noise parameter swept where there is
+    one.
+    """
     if method in ("lct", "dlct"):
         return [{"snr": snr, "falloff": scene.falloff} for snr in snrs]
     return [{"falloff": scene.falloff}] if method == "fk" else [{}]
 
 
 def classical_points(scene: Scene, method: str, snrs: tuple[float, ...]) -> tuple[Points, dict[str, float]]:
-    """A method's surface at its best: of all option sets and thresholds the one with the highest F-score against the truth.
+    """A method's surface at its best: of all option sets and thresholds the one with the highest F-score
+    against the truth.
 
     The F-score is the harmonic mean of coverage and of the share of points near the truth.
 
@@ -56,7 +61,9 @@ def classical_points(scene: Scene, method: str, snrs: tuple[float, ...]) -> tupl
 
 
 def errors_of(points: Points, scene: Scene) -> GeometryErrors:
-    """Errors against the first surface along z; points and truth are near each other within 2 cm in depth and one spot spacing."""
+    """Errors against the first surface along z; points and truth are near each other within 2 cm in depth and
+    one spot spacing.
+    """
     return geometry_errors(points, scene.truth, lateral_tolerance=scene.spacing)
 
 

@@ -1,4 +1,6 @@
-"""The generated parts of docs/results.md, from stored experiments; what stands between them is written by hand and kept."""
+"""The generated parts of docs/results.md, from stored experiments; what stands between them is written by
+hand and kept.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ END = "<!-- end -->"
 
 
 def update_page(page: Path, results: Path) -> list[str]:
-    """Rewrite the generated parts whose experiments are stored below ``results``; copy their figures and tables beside the page.
+    """Rewrite the generated parts whose experiments are stored below ``results``; copy their figures and
+    tables beside the page.
 
     Returns:
         the experiments that were written.

@@ -1,4 +1,6 @@
-"""Figures of the experiments, in the style of :mod:`nlos_lit.report.figures`. Functions take results and return figures."""
+"""Figures of the experiments, in the style of :mod:`nlos_lit.report.figures`. Functions take results and
+return figures.
+"""
 
 from __future__ import annotations
 
@@ -127,7 +129,9 @@ def images(
     extent: Sequence[tuple[float, float, float, float]],
     side: float = 1.75,
 ) -> Figure:
-    """Front views from the wall (+x to the left) in rows and columns; ``extent`` (x0, x1, y0, y1) in m of each row."""
+    """Front views from the wall (+x to the left) in rows and columns; ``extent`` (x0, x1, y0, y1) in m of
+    each row.
+    """
     figure = Figure(figsize=(1.2 + (side + 0.1) * len(columns), 0.4 + side * len(rows)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False)
     for i, row in enumerate(grid):
@@ -229,7 +233,9 @@ def progress(
     transients: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     extent: tuple[float, float, float, float],
 ) -> Figure:
-    """Volume, surface, kernel and a transient (path, measured, rendered) in rows, states of a training in columns."""
+    """Volume, surface, kernel and a transient (path, measured, rendered) in rows, states of a training in
+    columns.
+    """
     figure = Figure(figsize=(0.5 + 2.6 * len(labels), 9.2))
     panels = figure.subplots(4, len(labels), squeeze=False)
     for j, label in enumerate(labels):
@@ -265,7 +271,9 @@ def clouds(
     columns: Sequence[str],
     limit: float,
 ) -> Figure:
-    """Points ``[N, 3]`` from the wall coloured by a distance ``[N]`` (m), in rows and columns; ``limit`` in m is the darkest."""
+    """Points ``[N, 3]`` from the wall coloured by a distance ``[N]`` (m), in rows and columns; ``limit`` in m
+    is the darkest.
+    """
     figure = Figure(figsize=(1.1 + 1.75 * len(columns), 0.5 + 1.9 * len(rows)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex="row", sharey="row")
     drawn = None

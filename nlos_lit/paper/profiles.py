@@ -1,4 +1,6 @@
-"""Profiles of the model: as the paper writes it, as the authors' code does it, the default, the refinement, further effects."""
+"""Profiles of the model: as the paper writes it, as the authors' code does it, the default, the refinement,
+further effects.
+"""
 
 from __future__ import annotations
 

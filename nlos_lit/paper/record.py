@@ -41,7 +41,9 @@ class Glance:
     higher: bool = False
 
     def row(self) -> Row:
-        """The comparison as a row of a table; the verdict compares the better of ours with the better of the others."""
+        """The comparison as a row of a table; the verdict compares the better of ours with the better of the
+        others.
+        """
         known = {name: value for name, value in self.classical.items() if _known(value)}
         sign = -1 if self.higher else 1
         best = min(known, key=lambda name: sign * known[name]) if known else None

@@ -1,4 +1,6 @@
-"""The captures that experiments work on: simulated, rendered, or real; thinned or drawn anew where an experiment asks for it."""
+"""The captures that experiments work on: simulated, rendered, or real; thinned or drawn anew where an
+experiment asks for it.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ class Size:
     Args:
         name: of the size.
         experiment: config of conf/experiment for trainings.
-        real: real captures, renders and the bunny are used; otherwise small procedural scenes in their places.
+        real: real captures, renders and the bunny are used; otherwise small procedural scenes in their
+            places.
         seeds: of Table 1.
         counts: mean counts a spot of the noise ladder.
         minutes: exposures that the real capture is thinned to; the last is the whole file.
@@ -77,7 +80,9 @@ def sensor_of(bin_length: float, counts: float) -> SensorModel:
 
 
 def bunny(work: Workspace, size: Size) -> Subject:
-    """The paper's two-albedo bunny by the own simulator; reduced: the sphere before the plate, in two albedos."""
+    """The paper's two-albedo bunny by the own simulator; reduced: the sphere before the plate, in two
+    albedos.
+    """
     if size.real:
         scan = ScanPlan(nx=64, ny=64, width=2.0, bin_length=0.006, n_bins=512, t_start=1.8)
         label = "bunny, own simulator, 64×64 spots over 2 m, 5000 counts a spot"
@@ -159,7 +164,9 @@ def real_scenes(work: Workspace, size: Size) -> list[Subject]:
 
 
 def thinned(capture: Capture, share: float, seed: int) -> Capture:
-    """Every photon kept with probability ``share``: what a shorter exposure would have counted, where nothing saturates."""
+    """Every photon kept with probability ``share``: what a shorter exposure would have counted, where nothing
+    saturates.
+    """
     counts = np.random.default_rng(seed).binomial(capture.counts.astype(np.int64), share)
     steps = [*capture.provenance.get("steps", []), f"thinned binomially to {share:.4g}, seed {seed}"]
     return dataclasses.replace(

@@ -25,7 +25,9 @@ class Distances:
     from_truth: np.ndarray
 
     def summary(self, tolerance: float) -> dict[str, float]:
-        """RMSE, largest and 95th percentile in mm both ways; share of the truth nearer than ``tolerance`` (m)."""
+        """RMSE, largest and 95th percentile in mm both ways; share of the truth nearer than ``tolerance``
+        (m).
+        """
         entries = {}
         for name, values in (("surface→truth", self.to_truth), ("truth→surface", self.from_truth)):
             known = len(values) > 0
@@ -49,7 +51,9 @@ def sample(mesh: Mesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 
 def visible_sample(mesh: Mesh, wall: np.ndarray, count: int, share: float = 0.1, seed: int = 0) -> np.ndarray:
-    """``[N, 3]`` of ``count`` points of the mesh: those whose front at least ``share`` of the wall points ``[W, 3]`` see."""
+    """``[N, 3]`` of ``count`` points of the mesh: those whose front at least ``share`` of the wall points
+    ``[W, 3]`` see.
+    """
     points, face = sample(mesh, count, seed)
     normals = mesh.face_vectors[face]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -81,7 +85,8 @@ def surface_distances(
     Args:
         surface: the reconstruction; None where there is none, which leaves both lists of distances empty.
         truth: all of the true surface, which distances of the reconstruction are taken to.
-        visible: ``[M, 3]`` points of the truth that can be seen, from which distances to the reconstruction are taken.
+        visible: ``[M, 3]`` points of the truth that can be seen, from which distances to the reconstruction
+            are taken.
         count: points sampled on the reconstruction.
     """
     if surface is None:

@@ -49,7 +49,9 @@ class Subject:
 
 @dataclass(frozen=True)
 class Scene:
-    """A subject, loaded: as ``train.py`` would see it. ``mesh`` and ``truth`` are None where the truth is not known."""
+    """A subject, loaded: as ``train.py`` would see it. ``mesh`` and ``truth`` are None where the truth is not
+    known.
+    """
 
     capture: Capture
     truth: SurfaceTruth | None
@@ -71,10 +73,11 @@ class Scene:
 
 
 def run_training(arguments: list[str], output: Path) -> int:
-    """``train.py`` with ``arguments`` in a process of its own; what it prints goes to ``output``. Returns its exit status.
+    """``train.py`` with ``arguments`` in a process of its own; what it prints goes to ``output``. Returns its
+    exit status.
 
-    The process is forked from a server that has imported the libraries and done nothing else: imports take longer than a small
-    training.
+    The process is forked from a server that has imported the libraries and done nothing else: imports take
+    longer than a small training.
     """
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(
@@ -149,7 +152,8 @@ class Workspace:
             return {key: stored[key] for key in stored.files}
 
     def train(self, name: str, subject: Subject, *overrides: str, start: Path | None = None) -> Path:
-        """The run folder of a training, trained now unless a finished one is there; an interrupted one goes on.
+        """The run folder of a training, trained now unless a finished one is there; an interrupted one goes
+        on.
 
         Args:
             overrides: further settings of ``train.py``.

@@ -1,4 +1,6 @@
-"""Figures of a diagnosis. Functions take results and return figures; they compute nothing beyond counting and scaling."""
+"""Figures of a diagnosis. Functions take results and return figures; they compute nothing beyond counting and
+scaling.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
 
 @styled
 def residual_profile(profile: Profile, bin_length: float | None = None) -> Figure:
-    """Signed significance along an axis, before above after, on one scale; red beyond ±3σ. One panel where nothing changed."""
+    """Signed significance along an axis, before above after, on one scale; red beyond ±3σ. One panel where
+    nothing changed.
+    """
     panels = _panels(profile)
     figure = Figure(figsize=(7.5, 0.9 + 1.9 * len(panels)))
     every = np.abs(np.concatenate([profile.before, profile.after]))
@@ -109,7 +113,9 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
 
 @styled
 def residual_wall(profile: Profile) -> Figure:
-    """Signed significance over the wall, seen from it, before and after on one symmetric scale; one map where nothing changed."""
+    """Signed significance over the wall, seen from it, before and after on one symmetric scale; one map where
+    nothing changed.
+    """
     panels = _panels(profile)
     known = np.abs(np.concatenate([values[np.isfinite(values)] for values in panels.values()]))
     limit = max(3.0, float(np.quantile(known, 0.99))) if known.size else 3.0
@@ -127,7 +133,9 @@ def residual_wall(profile: Profile) -> Figure:
 
 @styled
 def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()) -> Figure:
-    """Score statistic of every effect, ranked by predicted gain; grey and hatched where it can hardly be told from the scene."""
+    """Score statistic of every effect, ranked by predicted gain; grey and hatched where it can hardly be told
+    from the scene.
+    """
     ranked = by_gain(screened)
     figure = Figure(figsize=(8, 1.3 + 0.27 * len(ranked)))
     axes = figure.subplots()
@@ -194,7 +202,9 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
 
 @styled
 def deviance_steps(diagnosis: Diagnosis) -> Figure:
-    """Deviance per bin on held-out spots after each accepted effect, and on the untouched spots; grey: counting noise."""
+    """Deviance per bin on held-out spots after each accepted effect, and on the untouched spots; grey:
+    counting noise.
+    """
     base, extended, test = diagnosis.base, diagnosis.extended, diagnosis.untouched_test
     steps = [("base", base.deviance_per_bin)]
     steps += [(f"+ {e.name}", e.heldout_gain.deviance_per_bin_after) for e in diagnosis.effects]
@@ -259,7 +269,9 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
 
 @styled
 def detection_limits(screened: Sequence[Screened], bin_length: float | None = None) -> Figure:
-    """Smallest amplitude that this capture would have revealed, a panel for each unit; grey where the scene can imitate it."""
+    """Smallest amplitude that this capture would have revealed, a panel for each unit; grey where the scene
+    can imitate it.
+    """
     panels: dict[str, list[tuple[str, float, bool, bool]]] = {}
     for one in screened:
         for name, value in one.detectable.items():
@@ -316,7 +328,8 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
 def witness_maps(
     maps: Mapping[str, Any], ends: tuple[np.ndarray, np.ndarray] | None = None, r: float | None = None
 ) -> Figure:
-    """Direct pulse's energy and the fitted wall gain, both over their mean, and one against the other; maps ``[nx, ny]``.
+    """Direct pulse's energy and the fitted wall gain, both over their mean, and one against the other; maps
+    ``[nx, ny]``.
 
     ``ends``: first and last edge of the wall in x and y, m; None counts spots.
     """

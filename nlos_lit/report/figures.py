@@ -1,6 +1,7 @@
 """Figures of results. Functions take results and return figures; beyond projections they compute nothing.
 
-Front views are drawn as seen from the relay wall: +y up, +x to the left (the world is right-handed with z into the scene).
+Front views are drawn as seen from the relay wall: +y up, +x to the left (the world is right-handed with z
+into the scene).
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ MOST_DRAWN = 20_000  # points a scatter plot still shows as a surface and draws 
 def volume_projections(
     values: np.ndarray, grid: VolumeGrid, threshold: float = 0.2, title: str = ""
 ) -> Figure:
-    """Maximum of a volume ``[nz, nx, ny]`` from the front, from the side and from above, and the depth of the maximum.
+    """Maximum of a volume ``[nz, nx, ny]`` from the front, from the side and from above, and the depth of the
+    maximum.
 
     The depth map is empty where a column's maximum is below ``threshold`` of the volume's.
     """
@@ -75,7 +77,9 @@ def volume_projections(
 
 @styled
 def albedo_projection(albedo: np.ndarray, mask: np.ndarray, grid: VolumeGrid) -> Figure:
-    """Front view of an albedo volume ``[nz, nx, ny]``: its maximum along z over the voxels of ``mask``; grey where none."""
+    """Front view of an albedo volume ``[nz, nx, ny]``: its maximum along z over the voxels of ``mask``; grey
+    where none.
+    """
     figure = Figure(figsize=(5, 4.2))
     image = np.where(mask, albedo, -np.inf).max(axis=0)
     ends = _ends(grid.x, grid.pitch[0]), _ends(grid.y, grid.pitch[1])
@@ -160,7 +164,9 @@ def kernel_plot(omega_pf: float, sigma_pf: float) -> Figure:
 
 @styled
 def laser_sensor_plot(psi: np.ndarray, bin_length: float, first: float = 0.0) -> Figure:
-    """The laser-sensor response Ψ, ``[K]`` a bin, against path length; ``first`` is the path length of its first entry, m."""
+    """The laser-sensor response Ψ, ``[K]`` a bin, against path length; ``first`` is the path length of its
+    first entry, m.
+    """
     figure = Figure(figsize=(5.5, 3.2))
     axes = figure.subplots()
     path = first + bin_length * np.arange(len(psi))
@@ -180,9 +186,11 @@ def transients_plot(
     labels: Sequence[str],
     band: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Figure:
-    """Measured against rendered transients ``[K, T]``, one panel a spot, against path length ``[T]`` (bin centres, m).
+    """Measured against rendered transients ``[K, T]``, one panel a spot, against path length ``[T]`` (bin
+    centres, m).
 
-    ``band`` = (low, high), each ``[K, T]``, is shaded: the range that the rendered transient and counting statistics allow.
+    ``band`` = (low, high), each ``[K, T]``, is shaded: the range that the rendered transient and counting
+    statistics allow.
     """
     columns = 1 if len(measured) < 3 else 2
     rows = -(-len(measured) // columns)
@@ -228,7 +236,9 @@ def loss_plot(history: Mapping[str, Sequence[float]]) -> Figure:
 
 @styled
 def parameter_plot(history: Mapping[str, Sequence[float]], units: Mapping[str, str]) -> Figure:
-    """Imaging parameters over the iterations, one panel each: name → values, name → unit (Fig. 5 of the paper)."""
+    """Imaging parameters over the iterations, one panel each: name → values, name → unit (Fig. 5 of the
+    paper).
+    """
     columns = min(len(history), 3)
     rows = -(-len(history) // columns)
     figure = Figure(figsize=(3.2 * columns, 0.5 + 2.2 * rows))

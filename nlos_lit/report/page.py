@@ -50,7 +50,8 @@ class Markup(str):
 def write_report(
     diagnosis: Diagnosis, folder: Path | str, extra_figures: Mapping[str, Figure] | None = None
 ) -> Path:
-    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png`` into ``folder``; returns the page's path.
+    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png`` into ``folder``;
+    returns the page's path.
 
     Args:
         extra_figures: further figures by name, shown at the end.

@@ -106,7 +106,9 @@ def amount(effect: str, parameter: str, value: float | None, bin_length: float |
 
 
 def headline(effect: str, parameters: Mapping[str, Estimate]) -> str:
-    """Size of an effect in a few words, shapes without their errors; parameter by parameter where its sentence does not fit."""
+    """Size of an effect in a few words, shapes without their errors; parameter by parameter where its
+    sentence does not fit.
+    """
 
     def short(name: str, estimate: Estimate) -> str:
         factor, unit = scales(effect, name, estimate.unit, estimate.value, None)[0]

@@ -15,9 +15,11 @@ BARELY = 0.05  # retained information below which the scene can imitate nearly a
 
 @dataclass(frozen=True)
 class Misfit:
-    """Deviance per bin of the base, taken apart: what counting noise makes, what the extension explains, what is left.
+    """Deviance per bin of the base, taken apart: what counting noise makes, what the extension explains, what
+    is left.
 
-    ``share`` is the explained part of the excess over noise, negative where the extension is worse; None without an excess.
+    ``share`` is the explained part of the excess over noise, negative where the extension is worse; None
+    without an excess.
     """
 
     noise: float
@@ -28,7 +30,9 @@ class Misfit:
 
 
 def misfit(diagnosis: Diagnosis) -> Misfit:
-    """On the untouched spots where they were scored, else on the held-out ones; each fit against its own noise level."""
+    """On the untouched spots where they were scored, else on the held-out ones; each fit against its own
+    noise level.
+    """
     base, extended, untouched = _scored(diagnosis)
     before, after = _excess(base), _excess(extended)
     if not (math.isfinite(before) and math.isfinite(after)) or before <= 0:
@@ -65,7 +69,9 @@ def tone(diagnosis: Diagnosis) -> str:
 
 
 def missing(diagnosis: Diagnosis) -> list[str]:
-    """What the simulation misses, in plain words, one entry for each effect and each group without an accepted one."""
+    """What the simulation misses, in plain words, one entry for each effect and each group without an
+    accepted one.
+    """
     names = {effect.name for effect in diagnosis.effects}
     found = [_one(diagnosis, effect) for effect in diagnosis.effects]
     for group in diagnosis.groups:
@@ -75,7 +81,9 @@ def missing(diagnosis: Diagnosis) -> list[str]:
 
 
 def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
-    """What is wrong, in plain words and one or two sentences; several things are only counted where they are not ``listed``."""
+    """What is wrong, in plain words and one or two sentences; several things are only counted where they are
+    not ``listed``.
+    """
     found = missing(diagnosis)
     axis = AXES.get(diagnosis.unexplained.axis, "on some axis")
     if not found:
@@ -156,7 +164,9 @@ def _nothing(diagnosis: Diagnosis) -> str:
 
 
 def _scored(diagnosis: Diagnosis) -> tuple[Scores, Scores, bool]:
-    """Base and extension on the untouched spots (True) where both were scored there, else on the held-out ones."""
+    """Base and extension on the untouched spots (True) where both were scored there, else on the held-out
+    ones.
+    """
     test = diagnosis.untouched_test
     if {"base", "extended"} <= set(test):
         return test["base"], test["extended"], True

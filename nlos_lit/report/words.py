@@ -24,7 +24,8 @@ class EffectWords:
         cause: the physics, one sentence.
         remedy: what to do on the rig, one sentence.
         headline: size of the effect, with ``{parameter}`` fields.
-        kind: of its numbers: ``percent``, ``time`` (m of path), ``length`` (m), ``angle`` (rad), ``bins``, ``counts`` or ``plain``.
+        kind: of its numbers: ``percent``, ``time`` (m of path), ``length`` (m), ``angle`` (rad), ``bins``,
+            ``counts`` or ``plain``.
         kinds: parameters of another kind.
         nulls: values that mean "absent", where that is not 0.
     """

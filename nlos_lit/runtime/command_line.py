@@ -31,7 +31,8 @@ def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> None:
-    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and nothing is resumed.
+    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and
+    nothing is resumed.
 
     ``diagnosis``: also when it holds a diagnosis.
     """
@@ -50,7 +51,9 @@ def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> Non
 
 
 def stay_in_run(arguments: list[str]) -> None:
-    """``run=FOLDER`` keeps log and config in FOLDER/diagnosis, too; in place. Exit where FOLDER is not a run's."""
+    """``run=FOLDER`` keeps log and config in FOLDER/diagnosis, too; in place. Exit where FOLDER is not a
+    run's.
+    """
     given = dict(item.split("=", 1) for item in arguments if "=" in item)
     if given.get("run", "null") == "null":
         return

@@ -49,7 +49,8 @@ def resident_bytes() -> int:
 def peak_bytes() -> int:
     """Largest resident memory of this process so far.
 
-    Linux keeps it for each program; getrusage(2), which is asked elsewhere, starts with that of the program that started this one.
+    Linux keeps it for each program; getrusage(2), which is asked elsewhere, starts with that of the program
+    that started this one.
     """
     status = Path("/proc/self/status")
     if status.exists():

@@ -21,7 +21,9 @@ log = logging.getLogger(__name__)
 
 
 class Ticker:
-    """One task's progress; ``update`` may be called as often as one likes, with another total where more is to be done."""
+    """One task's progress; ``update`` may be called as often as one likes, with another total where more is
+    to be done.
+    """
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
         self.what, self.total, self.start = what, total, done
@@ -60,7 +62,9 @@ class Ticker:
 
 
 class StepTicker:
-    """Progress of work whose steps differ and whose length is estimated on the way; as a context it closes its bar."""
+    """Progress of work whose steps differ and whose length is estimated on the way; as a context it closes
+    its bar.
+    """
 
     def __init__(self, what: str) -> None:
         console = Console(stderr=True)

@@ -1,4 +1,6 @@
-"""The steps of a diagnosis: said with the time that is left, and kept, so that an interrupted diagnosis goes on where it was."""
+"""The steps of a diagnosis: said with the time that is left, and kept, so that an interrupted diagnosis goes
+on where it was.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ class Steps:
     """Does the steps of one diagnosis.
 
     Args:
-        report: called at the start of each step with what it is, seconds since the start, and seconds that are left (an estimate,
-            for the turn at hand).
+        report: called at the start of each step with what it is, seconds since the start, and seconds that
+            are left (an estimate, for the turn at hand).
         folder: where results of steps are kept; None keeps nothing.
         settings: all that results depend on, as text.
 
@@ -52,7 +54,9 @@ class Steps:
         self.earlier = 0.0  # seconds that kept results took when they were made
 
     def share(self, objects: Mapping[str, Any]) -> None:
-        """Large objects that every result refers to; they are kept once, by whoever made them, not with each result."""
+        """Large objects that every result refers to; they are kept once, by whoever made them, not with each
+        result.
+        """
         self.shared.update(objects)
 
     def plan(self, **kinds: int) -> None:
@@ -70,7 +74,9 @@ class Steps:
         return sum(number * known.get(kind, unit * SHARE[kind]) for kind, number in self.ahead.items())
 
     def several(self, kind: str, jobs: list[tuple[str, str, Callable[[], T]]], at_once: int) -> list[T]:
-        """Results of independent steps (text, name, make), ``at_once`` of them at a time with a single thread of torch each."""
+        """Results of independent steps (text, name, make), ``at_once`` of them at a time with a single thread
+        of torch each.
+        """
         if at_once == 1:
             return [self(kind, *job) for job in jobs]
         threads = torch.get_num_threads()
@@ -83,7 +89,9 @@ class Steps:
             torch.set_num_threads(threads)
 
     def __call__(self, kind: str, text: str, name: str, make: Callable[[], T], at_once: int = 1) -> T:
-        """The result of ``make``, or of an earlier call that was kept under ``name``; ``at_once`` steps go on side by side."""
+        """The result of ``make``, or of an earlier call that was kept under ``name``; ``at_once`` steps go on
+        side by side.
+        """
         file = None if self.folder is None else self.folder / f"{name}.pickle"
         if file is not None and file.exists():
             self.ahead[kind] = max(0, self.ahead[kind] - 1)

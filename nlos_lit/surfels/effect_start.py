@@ -1,4 +1,6 @@
-"""Where scanned parameters of effects (delays, decays, periods) start: on their grids, where the counts ask for them most."""
+"""Where scanned parameters of effects (delays, decays, periods) start: on their grids, where the counts ask
+for them most.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,13 @@ from nlos_lit.surfels.model import SurfelModel
 
 @torch.no_grad()
 def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor) -> None:
-    """Set every effect that has scanned parameters to the best of its grid, its amplitudes to one scoring step from their null.
+    """Set every effect that has scanned parameters to the best of its grid, its amplitudes to one scoring
+    step from their null.
 
-    The step x maximises ``g·x - x·F x/2``, within bounds, with ``g = Σ (H/μ - 1) ∂μ/∂x`` and ``F = Σ ∂μ/∂x ∂μ/∂x / μ``; the best
-    grid point is that of the largest maximum. Surfels and other effects are held, so this is a start and not a test. An effect that
-    gains nothing anywhere is left at the null in the middle of its grid.
+    The step x maximises ``g·x - x·F x/2``, within bounds, with ``g = Σ (H/μ - 1) ∂μ/∂x`` and ``F = Σ ∂μ/∂x
+    ∂μ/∂x / μ``; the best grid point is that of the largest maximum. Surfels and other effects are held, so
+    this is a start and not a test. An effect that gains nothing anywhere is left at the null in the middle of
+    its grid.
 
     Args:
         spots: ``[B]``. counts: ``[B, T_gate]`` of them.

@@ -30,20 +30,25 @@ class RefineSettings:
 
     Args:
         floor: seeds are local maxima of the image of at least this share of its largest value …
-        significance: … whose Poisson score against the scan's mean transient exceeds this many standard deviations.
+        significance: … whose Poisson score against the scan's mean transient exceeds this many standard
+            deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
         max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else 1.
+        subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else
+            1.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
-        rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has twice as many.
+        rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
+            twice as many.
         more: last rounds that may follow, see :meth:`SurfelFit.converge`.
         batch: spots a step.
-        depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the unconstrained values.
+        depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the
+            unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
         tie: weight of :meth:`SurfelModel.bending`, nats per squared radian and pair.
         surfel_cost: nats that a surfel must be worth, see :meth:`SurfelModel.presence`.
         prune: surfels whose albedo is below this many of its standard deviations die.
-        grow: places next to surfels, and unused seeds, whose score exceeds this many standard deviations get one.
+        grow: places next to surfels, and unused seeds, whose score exceeds this many standard deviations get
+            one.
         test_spots: random training spots on which scores are computed.
         visibility: surfels hide one another.
     """
@@ -118,7 +123,9 @@ class SurfelFit:
 
     @torch.no_grad()
     def match_energy(self) -> None:
-        """Set the intensity so that rendered light makes up for what the background does not count, through all effects."""
+        """Set the intensity so that rendered light makes up for what the background does not count, through
+        all effects.
+        """
         sensor, spots, counted = (
             self.model.laser_sensor,
             self.train[self.tested],
@@ -148,7 +155,8 @@ class SurfelFit:
         steps: int | None = None,
         settle: bool = True,
     ) -> list[dict[str, float]]:
-        """``rounds`` rounds of ``steps`` batches (None: as set), the last twice as long; surfels die and grow between.
+        """``rounds`` rounds of ``steps`` batches (None: as set), the last twice as long; surfels die and grow
+        between.
 
         ``settle``: the first round comes from seeds, and the response waits for their places.
         Returns one entry a round: surfels, mean loss over its last quarter, response.
@@ -184,10 +192,12 @@ class SurfelFit:
         return history
 
     def converge(self, progress: Progress | None = None) -> list[dict[str, float]]:
-        """Last rounds anew, ``more`` at most, while the fit is above the noise and a round gains more than ``WORTH`` a parameter.
+        """Last rounds anew, ``more`` at most, while the fit is above the noise and a round gains more than
+        ``WORTH`` a parameter.
 
-        Bright captures take longer to converge; where the fit is at the noise already, more batches would only fit the noise.
-        Returns one entry a round; ``progress`` goes on from the batches that were done before.
+        Bright captures take longer to converge; where the fit is at the noise already, more batches would
+        only fit the noise. Returns one entry a round; ``progress`` goes on from the batches that were done
+        before.
         """
 
         def told(done: int, total: int) -> None:
@@ -218,7 +228,8 @@ class SurfelFit:
         s, model = self.settings, self.model
         last = left == 0
         steps *= 2 if last else 1
-        # The response waits for the places, the tie for the surface: both would otherwise settle around errors of the seeds.
+        # The response waits for the places, the tie for the surface: both would otherwise settle around
+        # errors of the seeds.
         response_rate = s.response_rate * (0.3 if settling else 1.0)
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
         tie = s.tie * 0.3 ** max(0, left - 1) * per_count

@@ -1,8 +1,9 @@
 """Where surfels begin, grow and die: candidates judged by the counts themselves.
 
-A candidate with throughput ``a[s, t]`` (its transient through the response, per unit albedo) is tested against the present
-expectation μ by the Poisson score: ``g = Σ (H/μ - 1) a``, information ``F = Σ a²/μ``, significance ``z = g/√F``, normal under
-noise alone. So a threshold in z means the same at every count rate, whatever the ambient light.
+A candidate with throughput ``a[s, t]`` (its transient through the response, per unit albedo) is tested
+against the present expectation μ by the Poisson score: ``g = Σ (H/μ - 1) a``, information ``F = Σ a²/μ``,
+significance ``z = g/√F``, normal under noise alone. So a threshold in z means the same at every count rate,
+whatever the ambient light.
 """
 
 from __future__ import annotations
@@ -60,7 +61,8 @@ class Score(NamedTuple):
 def volume_maxima(
     intensity: Tensor, grid: VolumeGrid, floor: float, per_cell: int, lateral: Lateral
 ) -> tuple[Candidates, Tensor]:
-    """Local maxima along z of at least ``floor`` × the volume's maximum, the ``per_cell`` largest of each lateral cell.
+    """Local maxima along z of at least ``floor`` × the volume's maximum, the ``per_cell`` largest of each
+    lateral cell.
 
     Their depths are interpolated between voxels by a parabola.
 
@@ -104,7 +106,9 @@ def cell_centres(index: Tensor, lateral: Lateral) -> Tensor:
 
 
 def rank_one(counts: Tensor) -> Tensor:
-    """``[S, T]`` expectation without structure: each spot's total times the mean transient (smoothed by a hair of background)."""
+    """``[S, T]`` expectation without structure: each spot's total times the mean transient (smoothed by a
+    hair of background).
+    """
     total = counts.sum(1, keepdim=True).double()
     mean = counts.double().sum(0) + 0.5
     return (total * (mean / mean.sum())).float().clamp_min(1e-4)
@@ -187,7 +191,8 @@ def score(
         energy = paths.contribution
         _, weights = spline_weights(time)
         g = (energy * (gather_bins(pull, time) * weights).sum(-1).view(shape)).sum((0, 2))
-        # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information otherwise.
+        # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information
+        # otherwise.
         f = (energy.sum(2) * (energy * (gather_bins(weight, time) * weights).sum(-1).view(shape)).sum(2)).sum(
             0
         )
@@ -264,11 +269,13 @@ def prune_and_grow(
     grow: float,
     hooks: Hooks = NOTHING,
 ) -> None:
-    """Drop surfels that the counts do not need or that left the volume; add some where the counts ask for more light.
+    """Drop surfels that the counts do not need or that left the volume; add some where the counts ask for
+    more light.
 
     Args:
         reserve: unused seeds; candidates besides the places next to surfels.
-        counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; ``tested`` are the rows that are looked at.
+        counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; ``tested`` are the rows that are
+            looked at.
         prune, grow: significances, over all training spots.
         hooks: effects of the present expectation; candidates are tested with their response.
     """
@@ -303,7 +310,8 @@ def prune_and_grow(
     result = test(places, 1)
     wanted = result.significance * math.sqrt(scale) > grow
     places, result = places.take(wanted), Score(*(v[wanted] for v in result))
-    # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to explain it otherwise.
+    # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to
+    # explain it otherwise.
     chosen = best_apart(places.centre, result.significance, apart)[: max(20, len(albedo) // 5)]
     start = (
         (FIRST_SHARE * result.score / result.information)[chosen]

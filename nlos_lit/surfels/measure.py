@@ -1,9 +1,10 @@
 """The effects as a measurement simulator: counts of a known scene with known effects.
 
-Path and time effects act on single paths, so the light is rendered by :class:`~nlos_lit.surfels.model.SurfelModel` from surfels cut
-from the true mesh, with the mesh's own visibility. Without effects this agrees with the ground-truth simulator, which shares no
-code with it, to 1e-3 in each spot's energy and 1e-5 in NMSE. With effects it is the model that is later fitted: a capture made
-here is no independent test of an effect's equation.
+Path and time effects act on single paths, so the light is rendered by
+:class:`~nlos_lit.surfels.model.SurfelModel` from surfels cut from the true mesh, with the mesh's own
+visibility. Without effects this agrees with the ground-truth simulator, which shares no code with it, to 1e-3
+in each spot's energy and 1e-5 in NMSE. With effects it is the model that is later fitted: a capture made here
+is no independent test of an effect's equation.
 """
 
 from __future__ import annotations
@@ -54,15 +55,19 @@ def measure(
 ) -> tuple[Capture, Truth]:
     """Measure a mesh with effects.
 
-    ``sensor.mean_counts`` and ``background`` are those without effects. Provenance gets ``effects``: what the effects report.
+    ``sensor.mean_counts`` and ``background`` are those without effects. Provenance gets ``effects``: what the
+    effects report.
 
     Args:
-        mesh, scan, sensor, two_sided, detail, progress: as of :func:`~data_modules.simulate.simulate_capture`.
+        mesh, scan, sensor, two_sided, detail, progress: as of
+            :func:`~data_modules.simulate.simulate_capture`.
         seed: of counts and random fields; None gives expected values (with the fields of seed 0).
-        effects, values, exposure: as of :func:`~nlos_lit.effects.strengths.effects_at`; ``sensor`` is exposed already.
+        effects, values, exposure: as of :func:`~nlos_lit.effects.strengths.effects_at`; ``sensor`` is exposed
+            already.
 
     Raises:
-        UserError: effects or values that do not exist or fit, a direct pulse, a gate that ends before the record.
+        UserError: effects or values that do not exist or fit, a direct pulse, a gate that ends before the
+            record.
         MemoryBudgetError: who sees whom does not fit this machine's free memory.
     """
     if sensor.direct_counts:
@@ -112,7 +117,8 @@ def truth_surfels(
 ) -> SurfelModel:
     """Surfels that are the patches of a mesh: their places, normals, albedo × area, and who sees whom.
 
-    Patches are as small as the ground-truth simulator's and taken as points. The model's bins are all of the capture's.
+    Patches are as small as the ground-truth simulator's and taken as points. The model's bins are all of the
+    capture's.
 
     Args:
         capture: wall points and time bins.
@@ -157,7 +163,9 @@ def truth_surfels(
 
 @torch.no_grad()
 def expected_counts(model: SurfelModel, effects: list[Effect]) -> Tensor:
-    """``[S, T]`` expected counts of all spots; the laser cycles of pile-up are such that its ``detections`` are those recorded."""
+    """``[S, T]`` expected counts of all spots; the laser cycles of pile-up are such that its ``detections``
+    are those recorded.
+    """
     spots = torch.arange(len(model.laser))
     counting = [effect for effect in effects if effect.stage == "counting"]
     expected = model.expected(spots, Extension([effect for effect in effects if effect.stage != "counting"]))
@@ -172,7 +180,8 @@ def expected_counts(model: SurfelModel, effects: list[Effect]) -> Tensor:
 
 
 def laser_cycles(photons: Tensor, detections: float) -> float:
-    """N with ``mean_s (1 - e^{-M_s/N}) = detections``, for M photons a spot ``[S]``; infinite for no detections.
+    """N with ``mean_s (1 - e^{-M_s/N}) = detections``, for M photons a spot ``[S]``; infinite for no
+    detections.
 
     Raises:
         UserError: spots without photons are too many for that.

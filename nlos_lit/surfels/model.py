@@ -29,8 +29,9 @@ class Lateral(NamedTuple):
 class SurfelModel(nn.Module):
     """Surfels with place, normal and albedo, and the laser-sensor response.
 
-    Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for that. "Depth" is the
-    place along it. State dicts are complete: :meth:`from_state` rebuilds the model with its number of surfels.
+    Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for
+    that. "Depth" is the place along it. State dicts are complete: :meth:`from_state` rebuilds the model with
+    its number of surfels.
 
     Args:
         capture: for its wall points and time axis; its counts are not kept.
@@ -116,7 +117,9 @@ class SurfelModel(nn.Module):
         return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
 
     def presence(self) -> Tensor:
-        """How many surfels there are, each counted as a/(a + ε) with ε a tenth of the mean albedo a: the weak ones feel it most."""
+        """How many surfels there are, each counted as a/(a + ε) with ε a tenth of the mean albedo a: the weak
+        ones feel it most.
+        """
         albedo = self.albedo()
         return (albedo / (albedo + 0.1 * albedo.detach().mean())).sum()
 
@@ -125,7 +128,8 @@ class SurfelModel(nn.Module):
         """Find from which wall points each surfel's centre is hidden by the front sheet of the others.
 
         Args:
-            opaque: surfels of at least this share of the mean albedo hide. skip: cells before the surfel that do not.
+            opaque: surfels of at least this share of the mean albedo hide. skip: cells before the surfel that
+                do not.
             samples: along each line of sight.
         """
         albedo, centre = self.albedo(), self.centre()

@@ -1,6 +1,7 @@
 """Refinement: surfels seeded from the phasor image and fitted to the raw counts by Poisson likelihood.
 
-The phasor image has the wavelength's resolution, the counts know depth far better. docs/refine.md tells what each step brought.
+The phasor image has the wavelength's resolution, the counts know depth far better. docs/refine.md tells what
+each step brought.
 """
 
 from __future__ import annotations
@@ -46,7 +47,8 @@ class Scores:
 class Refined:
     """A fitted surfel model.
 
-    ``heldout``: scores of the held-out spots that were given, None where there were none. ``history``: one entry a round.
+    ``heldout``: scores of the held-out spots that were given, None where there were none. ``history``: one
+    entry a round.
     """
 
     model: SurfelModel
@@ -78,7 +80,8 @@ def refine(
     heldout_spots: np.ndarray | None = None,
     scan_shapes: bool = False,
 ) -> Refined:
-    """Fit surfels and response to the counts of ``train_spots``; the counts of ``heldout_spots`` are only scored at the end.
+    """Fit surfels and response to the counts of ``train_spots``; the counts of ``heldout_spots`` are only
+    scored at the end.
 
     Args:
         capture: raw counts and scan.
@@ -89,8 +92,8 @@ def refine(
         progress: called with (steps done, of how many).
         seed: of batches and tested spots.
         heldout_spots: ``[N']`` rows to score; None scores nothing.
-        scan_shapes: after a first round start the extension's scanned parameters where the counts ask for them, instead of where
-            they are; costs one round more.
+        scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
+            them, instead of where they are; costs one round more.
 
     Raises:
         UserError: shapes disagree, or no place of the image is significant in the counts.

@@ -20,7 +20,9 @@ from nlos_lit.training.self_calibration import SelfCalibration
 
 
 class Scores(L.Callback):
-    """Loss and held-out scores over fixed spots before the first and after the last iteration, kept through checkpoints."""
+    """Loss and held-out scores over fixed spots before the first and after the last iteration, kept through
+    checkpoints.
+    """
 
     def on_fit_start(self, trainer: L.Trainer, module: SelfCalibration) -> None:
         if not module.scores:
@@ -174,7 +176,8 @@ def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
 def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray, block: int = 16) -> Points:
     """The surface seen from the scanned wall points of ``spots``, in world coordinates.
 
-    Where one sensor point serves all spots, the laser points look in its stead: the volume can be seen from anywhere.
+    Where one sensor point serves all spots, the laser points look in its stead: the volume can be seen from
+    anywhere.
     """
     pipeline = module.pipeline
     volume = pipeline.phasor()

@@ -52,9 +52,11 @@ def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def refine_run(run: Run, folder: Path) -> dict[str, Any]:
-    """Fit surfels, with the run's effects, to the training spots from its image; points, mesh, figures and model in ``refined/``.
+    """Fit surfels, with the run's effects, to the training spots from its image; points, mesh, figures and
+    model in ``refined/``.
 
-    Returns the summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors where truth is known.
+    Returns the summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors
+    where truth is known.
     """
     module, capture, place = run.module, run.capture, folder / "refined"
     grid = module.pipeline.phasor.grid
@@ -97,7 +99,8 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
 
 
 def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Extension]:
-    """Surfels and effects that a run left in ``folder``; ``model.expected(spots, extension)`` are its expected counts.
+    """Surfels and effects that a run left in ``folder``; ``model.expected(spots, extension)`` are its
+    expected counts.
 
     Args:
         capture: the run's, as :func:`~nlos_lit.training.run_folder.open_run` gives it.

@@ -37,7 +37,9 @@ _MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_pla
 
 @dataclass
 class Run:
-    """A capture with the module that is fitted to it, and effects, at their nulls, that are fitted with the surfels."""
+    """A capture with the module that is fitted to it, and effects, at their nulls, that are fitted with the
+    surfels.
+    """
 
     config: dict[str, Any]
     capture: Capture
@@ -72,9 +74,11 @@ def field_shards(config: Mapping[str, Any]) -> int:
 
 
 def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", shards: int = 1) -> Run:
-    """Everything before the first iteration: capture, volume, memory estimate, propagated phasor field, start values.
+    """Everything before the first iteration: capture, volume, memory estimate, propagated phasor field, start
+    values.
 
-    Where several processes share the field (``shards``), it and the start values are made when the fit begins.
+    Where several processes share the field (``shards``), it and the start values are made when the fit
+    begins.
 
     Raises:
         UserError: the data, the geometry or the settings cannot work; nothing has been written then.
@@ -159,7 +163,8 @@ def open_run(folder: str | Path) -> Run:
 
 
 def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | None:
-    """The checkpoint file to go on from; ``last`` is that of ``folder``, else of the scene's newest run beside it.
+    """The checkpoint file to go on from; ``last`` is that of ``folder``, else of the scene's newest run
+    beside it.
 
     Raises:
         UserError: there is none.
@@ -187,8 +192,9 @@ _SCRATCH = 100 * 2**20  # runs of samples that are worked on at once
 def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     """What a run takes beyond what its process holds before the field is propagated.
 
-    Measured parts: a voxel costs an iteration about 18 numbers (intensity, albedo, gradients, Adam's moments), a ray 120 bytes of
-    directions, tables and the tenth of rays that meet something. Matching the energy looks at twice the spots without gradients.
+    Measured parts: a voxel costs an iteration about 18 numbers (intensity, albedo, gradients, Adam's
+    moments), a ray 120 bytes of directions, tables and the tenth of rays that meet something. Matching the
+    energy looks at twice the spots without gradients.
 
     Args:
         n_voxels: of the volume.

@@ -21,8 +21,8 @@ log = logging.getLogger(__name__)
 class SelfCalibration(L.LightningModule):
     """Minimise Eq. 11-14 over Θ = {Θ_pf, Θ_ls, Θ_G}.
 
-    One epoch is one iteration (one batch of spots), so that every checkpoint lies between two optimiser steps and a resumed
-    run repeats the uninterrupted one.
+    One epoch is one iteration (one batch of spots), so that every checkpoint lies between two optimiser steps
+    and a resumed run repeats the uninterrupted one.
 
     Args:
         pipeline: the simulated measurement, its phasor field prepared (or by ``prepare``).
@@ -30,10 +30,12 @@ class SelfCalibration(L.LightningModule):
         optimise: which of ``phasor``, ``sensor``, ``albedo`` are fitted; the others keep their start values.
         rates: learning rate per group, on the unconstrained parameters.
         lambda_sparsity, lambda_albedo: λ1 and λ2.
-        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes all.
+        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes
+            all.
         clip: largest joint gradient norm; None does not clip.
         seed: of the batches of voxels.
-        prepare: makes the phasor field once the processes that share it know each other; None where it is made.
+        prepare: makes the phasor field once the processes that share it know each other; None where it is
+            made.
     """
 
     def __init__(

@@ -74,7 +74,9 @@ def versions() -> dict[str, str | None]:
 
 
 def git_state(root: Path = ROOT) -> dict[str, Any] | None:
-    """``{"commit", "dirty"}`` of the checkout whose top is ``root`` (dirty: a tracked file differs); None where there is none."""
+    """``{"commit", "dirty"}`` of the checkout whose top is ``root`` (dirty: a tracked file differs); None
+    where there is none.
+    """
     top = _git(root, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != Path(root).resolve():
         return None

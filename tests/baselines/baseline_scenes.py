@@ -26,7 +26,9 @@ def transients(
     power: float = 2.0,
     width: float = 0.8,
 ) -> np.ndarray:
-    """``[S, bins]`` Gaussian pulses, ``width`` bins wide, at ``|p-l| + |p-s|``, with energy ``1/(|p-l|·|p-s|)^power``."""
+    """``[S, bins]`` Gaussian pulses, ``width`` bins wide, at ``|p-l| + |p-s|``, with energy
+    ``1/(|p-l|·|p-s|)^power``.
+    """
     edges = t_start + bin_length * np.arange(bins + 1)
     total = np.zeros((len(laser), bins))
     for point in points:

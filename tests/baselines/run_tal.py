@@ -1,4 +1,6 @@
-"""Run by the interpreter that has y-tal: CAPTURE OUT.npz WAVELENGTH CYCLES FIRST STEP PLANES, leaves pf and fk."""
+"""Run by the interpreter that has y-tal: CAPTURE OUT.npz WAVELENGTH CYCLES FIRST STEP PLANES, leaves pf and
+fk.
+"""
 
 import sys
 

@@ -55,7 +55,9 @@ def test_fbp_is_the_laplacian_of_gaussian_of_bp():
 
 
 def test_fbp_second_derivative_of_a_parabola():
-    """On counts that are a parabola of depth the filter returns its curvature: -σ²·d²/dz² (in voxels) of -(z/dz)² is 2σ²."""
+    """On counts that are a parabola of depth the filter returns its curvature: -σ²·d²/dz² (in voxels) of
+    -(z/dz)² is 2σ².
+    """
     t = (np.arange(200) + 0.5) * 0.01
     counts = (400.0 - (t / 2 / 0.025 - 15) ** 2)[None].astype(np.float32).clip(0)
     zero = np.zeros((1, 3))
@@ -105,9 +107,11 @@ def test_wiener_filter_is_the_regularised_inverse(snr):
 
 
 def test_wiener_filter_inverts_the_cone():
-    """Two points put through the literal light-cone sum come back, in units of density, when the noise is small.
+    """Two points put through the literal light-cone sum come back, in units of density, when the noise is
+    small.
 
-    The pitch is so large that each cone leaves the last cell of v before it leaves the lattice: nothing is cut off.
+    The pitch is so large that each cone leaves the last cell of v before it leaves the lattice: nothing is
+    cut off.
     """
     points = {(4, 6): 1.0, (6, 4): 0.6}
     cone = np.zeros((24, 11, 11))

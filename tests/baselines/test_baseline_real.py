@@ -32,7 +32,9 @@ def rendered(name: str) -> Capture:
 
 
 def depth_errors(volume, grid: VolumeGrid, threshold: float) -> tuple[np.ndarray, float, float]:
-    """Depth error in voxels where truth and volume have a surface, share of the truth that is covered, share that is false."""
+    """Depth error in voxels where truth and volume have a surface, share of the truth that is covered, share
+    that is false.
+    """
     with h5py.File(real_file("rendered/z_gt.h5")) as file:
         depth, x, y = file["depth"][()], file["x"][()], file["y"][()]
     nearest = np.ix_(np.abs(x - grid.x[:, None]).argmin(1), np.abs(y - grid.y[:, None]).argmin(1))

@@ -105,7 +105,8 @@ def test_volume_outside_the_gate(method, gate):
 def test_gated_transients():
     capture = capture_of(WALL, WALL, [POINT], 128, 0.02, t_start=-0.05, gate=(1, 90))
     found, start = gated_transients(capture, 1.0, 0.0)
-    # bins 0 to 2 begin at negative paths; the bin at path 1.0 is number 52 (from 0.99 to 1.01), one more is kept
+    # bins 0 to 2 begin at negative paths; the bin at path 1.0 is number 52 (from 0.99 to 1.01), one more is
+    # kept
     assert start == pytest.approx(0.01)
     assert found.shape == (30, 51)
     np.testing.assert_allclose(found.numpy(), capture.counts[:, 3:54])
@@ -142,7 +143,8 @@ def test_estimates_follow_the_size():
     small = capture_of(wall, wall, [POINT], 128, 0.02)
     large = dataclasses.replace(small, counts=np.repeat(small.counts, 4, axis=1), bin_length=0.005, gate=None)
     for method in ("lct", "fk"):
-        # each further bin the volume's light can reach adds at least its padded spectrum: twice as many bins, x and y of 4 bytes
+        # each further bin the volume's light can reach adds at least its padded spectrum: twice as many bins,
+        # x and y of 4 bytes
         assert estimate_bytes(large, GRID, method) - estimate_bytes(small, GRID, method) > 4 * 8 * 1024 * 250
     big = dataclasses.replace(GRID, shape=(256, 256, 256))
     for method in METHODS:

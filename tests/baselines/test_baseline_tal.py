@@ -1,6 +1,7 @@
 """Phasor imaging and f-k migration against y-tal's ``pf`` and ``fk`` on one capture each.
 
-y-tal needs an environment of its own (``make tal``), or one named by ``TAL_PYTHON``; without it these tests are skipped.
+y-tal needs an environment of its own (``make tal``), or one named by ``TAL_PYTHON``; without it these tests
+are skipped.
 """
 
 from __future__ import annotations
@@ -80,7 +81,9 @@ def test_phasor_imaging(name, tmp_path):
 
 
 def test_migration(tmp_path):
-    """Plane k of tal lies k + 1/2 half bins away. Its f-k interpolates linearly, ours by splines: side lobes along z differ."""
+    """Plane k of tal lies k + 1/2 half bins away. Its f-k interpolates linearly, ours by splines: side lobes
+    along z differ.
+    """
     capture = captured("z_confocal_64_d3")
     theirs = by_tal(capture, tmp_path)["fk"][120:240]
     ours = reconstruct(capture, grid_of(capture, 120.5 * 0.003, 0.003, 120), "fk").numpy()

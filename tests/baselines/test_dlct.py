@@ -1,4 +1,6 @@
-"""The directional light-cone transform: normals of plates that an independent simulator measured, and its equations written out."""
+"""The directional light-cone transform: normals of plates that an independent simulator measured, and its
+equations written out.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ GRID = box((-0.484375, 0.484375, 32), (-0.484375, 0.484375, 32), (0.4, 0.8, 81))
 
 
 def measured_plate(turn_x: float, turn_y: float) -> Capture:
-    """Expected values of a plate 0.4 m wide at (0.05, -0.03, 0.6), both cosines at the plate and at the wall included."""
+    """Expected values of a plate 0.4 m wide at (0.05, -0.03, 0.6), both cosines at the plate and at the wall
+    included.
+    """
     scan = ScanPlan(nx=32, ny=32, width=1.0, bin_length=0.01, n_bins=200)
     sensor = SensorModel(sigma=0.005, kappa=float("inf"), background=0.0)
     return simulate_capture(
@@ -61,7 +65,9 @@ def test_magnitude_of_a_plate_that_faces_the_wall_is_that_of_the_light_cone_tran
 
 
 def test_three_channels_solve_the_least_squares_written_out():
-    """``Σ_i K_i S_i = g`` with penalty, as dense matrices on the padded domain; then to depth by hand at the cells' own depths."""
+    """``Σ_i K_i S_i = g`` with penalty, as dense matrices on the padded domain; then to depth by hand at the
+    cells' own depths.
+    """
     wall = lattice(3, 2, 0.12, 0.15)
     counts = np.random.default_rng(4).poisson(3.0, (6, 12)).astype(np.uint16)
     normals = np.tile([0.0, 0.0, 1.0], (6, 1))

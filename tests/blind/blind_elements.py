@@ -1,8 +1,8 @@
 """A renderer of its own for the blind test: point elements of a mesh, with any weight on each path.
 
-Third bounce: ``Σ_e A ρ/π³ · cosθ_l cosθ_e1 cosθ_e2 cosθ_s / (d1² d2²) · V`` at path ``d1 + d2``; fourth bounce the same over pairs
-of elements with ``ρ/π · cosθ cosθ A / d²`` between them. Every element is a point; the bins that are made of the fine ones do
-not show it.
+Third bounce: ``Σ_e A ρ/π³ · cosθ_l cosθ_e1 cosθ_e2 cosθ_s / (d1² d2²) · V`` at path ``d1 + d2``; fourth
+bounce the same over pairs of elements with ``ρ/π · cosθ cosθ A / d²`` between them. Every element is a point;
+the bins that are made of the fine ones do not show it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ BLOCK_PATHS = 400_000  # so that a block's arrays stay in the cache
 
 @dataclass(frozen=True)
 class Elements:
-    """Centres ``[N, 3]`` m, unit normals ``[N, 3]``, areas ``[N]`` m² and albedos ``[N]`` of a surface cut small."""
+    """Centres ``[N, 3]`` m, unit normals ``[N, 3]``, areas ``[N]`` m² and albedos ``[N]`` of a surface cut
+    small.
+    """
 
     centre: np.ndarray
     normal: np.ndarray
@@ -38,7 +40,9 @@ class Elements:
 
 @dataclass(frozen=True)
 class Legs:
-    """Both legs of the paths of some spots: ``to_laser`` and ``to_sensor`` are unit vectors from the element, 3 × ``[B, N]``."""
+    """Both legs of the paths of some spots: ``to_laser`` and ``to_sensor`` are unit vectors from the element,
+    3 × ``[B, N]``.
+    """
 
     d1: np.ndarray
     d2: np.ndarray
@@ -122,7 +126,8 @@ def third_bounce(
     axis: Axis,
     weights: tuple[Callable[[Legs], np.ndarray], ...] = (),
 ) -> np.ndarray:
-    """``[S, n]`` light per fine bin; ``seen`` ``[S, N]`` of both legs together, ``weights`` give a factor ``[B, N]`` each.
+    """``[S, n]`` light per fine bin; ``seen`` ``[S, N]`` of both legs together, ``weights`` give a factor
+    ``[B, N]`` each.
 
     The wall's normals are +z.
     """
@@ -144,7 +149,9 @@ def third_bounce(
 
 
 def fourth_bounce(elements: Elements, wall: np.ndarray, seen: np.ndarray, axis: Axis) -> np.ndarray:
-    """``[S, n]`` light of laser → wall → element a → element b → wall → sensor in a confocal scan; elements see each other."""
+    """``[S, n]`` light of laser → wall → element a → element b → wall → sensor in a confocal scan; elements
+    see each other.
+    """
     gap = elements.centre[None] - elements.centre[:, None]
     distance = np.linalg.norm(gap, axis=2)
     np.fill_diagonal(distance, 1)

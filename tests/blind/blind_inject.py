@@ -1,4 +1,5 @@
-"""What can be hidden in a capture of the blind test, each by formulas of its own; the light's way is in `Work.expected`.
+"""What can be hidden in a capture of the blind test, each by formulas of its own; the light's way is in
+`Work.expected`.
 
 Each injector takes the `Work` and a strength and returns the true values of the reported quantities.
 """

@@ -1,7 +1,7 @@
 """A diagnosis of a hidden capture, and whether it was right.
 
-The code under test gets the capture file and nothing else. The oracle is told the true effect's name and goes through the same
-refits; its gain says what was there to be had.
+The code under test gets the capture file and nothing else. The oracle is told the true effect's name and goes
+through the same refits; its gain says what was there to be had.
 """
 
 from __future__ import annotations
@@ -34,11 +34,13 @@ class Outcome:
     """What was hidden and what was said.
 
     Args:
-        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control on spots that neither
-            fitted, scaled to the number of fitted spots; statistic_error: its standard error, by bootstrap over wall blocks.
+        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control
+            on spots that neither fitted, scaled to the number of fitted spots; statistic_error: its standard
+            error, by bootstrap over wall blocks.
         gain, oracle: nats on the select spots.
         errors: per true quantity, (found - true)/stderr and found/true - 1.
-        screened: the six best of the first screening: name, statistic, predicted gain (nats), retained information.
+        screened: the six best of the first screening: name, statistic, predicted gain (nats), retained
+            information.
     """
 
     spec: dict
@@ -131,7 +133,9 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
 def oracle_gain(
     truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
 ) -> Comparison:
-    """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and from new seeds."""
+    """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and
+    from new seeds.
+    """
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
     warm = refit_with(found.base, candidates, options.steps, 0)

@@ -1,8 +1,8 @@
 """The scenes of the blind test: light without sensor on a fine time axis, and the scan that sees it.
 
-A scan is 32 × 32 spots; the time window holds all the light with a margin. Own scenes are rendered by `blind_elements`, the others
-are path-traced renders (expected values with Monte-Carlo noise of a few per cent a bin), refined in time by a monotone cubic
-interpolation of the cumulative light.
+A scan is 32 × 32 spots; the time window holds all the light with a margin. Own scenes are rendered by
+`blind_elements`, the others are path-traced renders (expected values with Monte-Carlo noise of a few per cent
+a bin), refined in time by a monotone cubic interpolation of the cumulative light.
 """
 
 from __future__ import annotations
@@ -29,7 +29,9 @@ PAD = 16  # bins beyond either end of the window, from which light can be moved 
 
 
 def corner() -> Mesh:
-    """Two plates that face each other and the wall, like the inside of an opened book: much light bounces twice."""
+    """Two plates that face each other and the wall, like the inside of an opened book: much light bounces
+    twice.
+    """
     left = plate((0.18, 0.03, 0.76), 0.44, 0.40, turn_y=np.deg2rad(42), albedo=0.9)
     right = plate((-0.15, -0.02, 0.78), 0.34, 0.46, turn_y=np.deg2rad(-36), albedo=0.6)
     return join(left, right)
@@ -57,7 +59,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a scene is made: ``mesh`` and ``width`` (m) of the scanned wall, or the name of a ``render``; element ``size``, m."""
+    """How a scene is made: ``mesh`` and ``width`` (m) of the scanned wall, or the name of a ``render``;
+    element ``size``, m.
+    """
 
     window: Window
     mesh: Callable[[], Mesh] | None = None
@@ -115,14 +119,18 @@ class Scene:
         wall: np.ndarray | None = None,
         lift: float = 0.0,
     ) -> np.ndarray:
-        """Light of an own scene with weights on its paths, true ``wall`` points, or the scene ``lift`` m nearer to the wall."""
+        """Light of an own scene with weights on its paths, true ``wall`` points, or the scene ``lift`` m
+        nearer to the wall.
+        """
         wall = self.laser if wall is None else wall
         return third_bounce(
             self.elements.moved((0, 0, -lift)), wall, wall, self.seen, self.window.fine, weights
         )
 
     def apart(self, sensor: np.ndarray) -> np.ndarray:
-        """Light of an own scene where the sensor looks at ``sensor`` ``[S, 3]`` instead of at the laser's points."""
+        """Light of an own scene where the sensor looks at ``sensor`` ``[S, 3]`` instead of at the laser's
+        points.
+        """
         seen = self.seen & sight(self.mesh, self.elements, sensor)
         return third_bounce(self.elements, self.laser, sensor, seen, self.window.fine)
 

@@ -2,8 +2,8 @@
 
     truth = make_capture(draw_spec(7), "capture.hdf5")
 
-writes a y-tal file that tells nothing, and returns the truth. A capture is scene × hidden effects × strengths × photon level ×
-seed.
+writes a y-tal file that tells nothing, and returns the truth. A capture is scene × hidden effects × strengths
+× photon level × seed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Spec:
         effects: hidden, from `EFFECTS` or `UNKNOWN`; none, one or two.
         strengths: 0 … 3 for each, see `STRENGTHS`.
         level: counts of the scene a spot, on average over the scan.
-        seed: of shapes and photons. The shape of an effect depends on nothing else, so that alone and in a pair it is the same.
+        seed: of shapes and photons. The shape of an effect depends on nothing else, so that alone and in a
+            pair it is the same.
         order: ``raster`` or ``serpentine``.
     """
 
@@ -134,8 +135,9 @@ def hide(spec: Spec) -> Truth:
 def true_statistic(truth: Truth) -> float:
     """Twice the Kullback–Leibler divergence of the expected counts with the effects from those without.
 
-    The best a likelihood-ratio test could expect if it knew the scene and everything else but one global factor on all counts.
-    A test that must fit scene, response and background can expect less: how much less is the effect's retained information.
+    The best a likelihood-ratio test could expect if it knew the scene and everything else but one global
+    factor on all counts. A test that must fit scene, response and background can expect less: how much less
+    is the effect's retained information.
     """
     with_, without = truth.expected, truth.without
     without = without * (with_.sum() / without.sum())

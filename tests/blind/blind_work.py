@@ -1,4 +1,6 @@
-"""A measurement in the making, on which the hidden effects of the blind test act; expected values on a fine time axis."""
+"""A measurement in the making, on which the hidden effects of the blind test act; expected values on a fine
+time axis.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,15 @@ class Work:
     """A measurement in the making; injectors change it.
 
     Args:
-        scene: what is seen. level: counts of the scene a spot, on average. rank: ``[S]`` order of acquisition, -1 to 1.
+        scene: what is seen. level: counts of the scene a spot, on average. rank: ``[S]`` order of
+            acquisition, -1 to 1.
         rng: for shapes of the effect.
         light: ``[S, n]`` clean light on the fine axis.
-        delay: ``[S]`` m and ``stretch``: a photon at path L comes at L + delay + stretch·(L - middle of the window).
+        delay: ``[S]`` m and ``stretch``: a photon at path L comes at L + delay + stretch·(L - middle of the
+            window).
         response: acts on ``[S, n]`` after the ordinary response, with the fine step in m.
-        gain: ``[S]`` relative factor on the scene's light. background: ``[S, T]`` counts. counting: acts on ``[S, T]`` counts.
+        gain: ``[S]`` relative factor on the scene's light. background: ``[S, T]`` counts. counting: acts on
+            ``[S, T]`` counts.
     """
 
     scene: Scene
@@ -74,7 +79,8 @@ class Work:
     def expected(self) -> np.ndarray:
         """``[S, T]`` counts."""
         signal = self.signal()
-        # What changes the gain leaves the light of the whole scan as it is, so that the photon level is what was asked for.
+        # What changes the gain leaves the light of the whole scan as it is, so that the photon level is what
+        # was asked for.
         each = signal.sum(axis=1)
         counts = signal * (self.gain * (each.sum() / (each @ self.gain)))[:, None] + self.background
         for change in self.counting:
@@ -83,7 +89,9 @@ class Work:
 
 
 def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: float) -> np.ndarray:
-    """Light ``[S, n]`` at path L brought to L + delay + stretch·(L - middle): the cumulative light is interpolated linearly."""
+    """Light ``[S, n]`` at path L brought to L + delay + stretch·(L - middle): the cumulative light is
+    interpolated linearly.
+    """
     if not delay.any() and stretch == 0:
         return light
     edges, middle = scene.window.fine.edges, scene.window.middle
@@ -95,7 +103,9 @@ def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: f
 
 
 def wave(work: Work) -> np.ndarray:
-    """``[S]`` smooth random function of the scan order, mean 0, peak to peak 1: three slow cosines, never just a slope."""
+    """``[S]`` smooth random function of the scan order, mean 0, peak to peak 1: three slow cosines, never
+    just a slope.
+    """
     u = (work.rank + 1) / 2
     size = work.rng.uniform(0.5, 1.0, 3) * work.rng.choice([-1, 1], 3) / [1.0, 1.2, 2.0]
     values = sum(a * np.cos(np.pi * k * u) for k, a in enumerate(size, 1))

@@ -1,4 +1,6 @@
-"""Captures with something hidden in them are diagnosed from their files alone; benchmarks/blind.py does the same at length."""
+"""Captures with something hidden in them are diagnosed from their files alone; benchmarks/blind.py does the
+same at length.
+"""
 
 from __future__ import annotations
 
@@ -60,13 +62,17 @@ def test_what_no_effect_explains_is_called_unexplained():
 
 @pytest.mark.slow
 def test_a_gap_in_the_time_codes_is_not_called_a_ripple():
-    """Five codes lose 90 %: a ripple with half a period there gains most by far, but its strength is not the same everywhere."""
+    """Five codes lose 90 %: a ripple with half a period there gains most by far, but its strength is not the
+    same everywhere.
+    """
     check(run_case(Spec("sphere_before_plate", ("missing_codes",), (3,), 500, 1), QUICK, oracle=False))
 
 
 @pytest.mark.slow
 def test_a_detector_that_saturates_is_not_called_a_dark_wall():
-    """It loses most where the scene is bright: a smooth map over the wall explains it, but the map follows the count rate."""
+    """It loses most where the scene is bright: a smooth map over the wall explains it, but the map follows
+    the count rate.
+    """
     check(run_case(Spec("default", ("saturation",), (3,), 1500, 4108), QUICK, oracle=False))
 
 

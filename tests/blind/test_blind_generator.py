@@ -111,7 +111,8 @@ def test_what_does_not_fit_is_refused():
 
 
 def test_no_code_is_shared_with_what_is_tested():
-    # blind_judge.py runs the code under test; nothing that hides effects may import it, which the loaded modules below show.
+    # blind_judge.py runs the code under test; nothing that hides effects may import it, which the loaded
+    # modules below show.
     for path in set(HERE.glob("blind_*.py")) - {HERE / "blind_judge.py"}:
         for node in ast.walk(ast.parse(path.read_text())):
             names = [a.name for a in node.names] if isinstance(node, ast.Import) else []

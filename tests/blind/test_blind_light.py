@@ -43,7 +43,8 @@ def test_own_light_is_the_simulators(name):
 
 
 def test_third_bounce_of_one_element_by_hand():
-    # Laser right before the element, sensor 0.6 m aside: d1 = 0.8, d2 = 1.0, both cosines at the sensor's leg are 0.8.
+    # Laser right before the element, sensor 0.6 m aside: d1 = 0.8, d2 = 1.0, both cosines at the sensor's leg
+    # are 0.8.
     laser, sensor = np.array([[0.0, 0.0, 0.0]]), np.array([[0.6, 0.0, 0.0]])
     light = third_bounce(
         points((0, 0, 0.8), area=2e-4, albedo=0.5), laser, sensor, np.ones((1, 1), bool), Axis(0.0, 0.01, 300)

@@ -14,7 +14,8 @@ from effect_hand import ONE, SPOT, effect, hand_paths, hand_scan
 def test_retroreflection_turns_the_fourth_power_into_the_second():
     retro = effect("retroreflection", falloff=2.0, cosine=1.0)
     near, far = (retro.path(ONE, hand_paths(d, d), SPOT).item() for d in (0.5, 1.0))
-    # The base carries d⁻⁴; twice as far, a retroreflector is 4 times and not 16 times darker, so the factor is 4.
+    # The base carries d⁻⁴; twice as far, a retroreflector is 4 times and not 16 times darker, so the factor
+    # is 4.
     assert far / near == pytest.approx(4.0, rel=1e-5)
     # At d0, half the path at the middle of the gate 0.62 m + 35 bins of 2 cm = 1.32 m, nothing changes.
     assert retro.path(ONE, hand_paths(0.66, 0.66), SPOT).item() == pytest.approx(1.0, rel=1e-5)
@@ -36,12 +37,14 @@ def test_specular_lobe_peaks_along_the_mirror_direction():
 
 
 def test_occlusion_blocks_legs_that_cross_the_disc():
-    # Disc of radius 0.1 at (0.25, 0, 0.5). The leg from (0.5, 0, 0) to (0, 0, 1) crosses its centre, that from (0, 0, 0) passes.
+    # Disc of radius 0.1 at (0.25, 0, 0.5). The leg from (0.5, 0, 0) to (0, 0, 1) crosses its centre, that
+    # from (0, 0, 0) passes.
     scan = hand_scan([[0.5, 0, 0], [0.0, 0, 0]], [[0.0, 0, 0], [0.0, 0, 0]])
     disc = effect("occlusion", scan=scan, opacity=0.6, x=0.25, y=0.0, z=0.5, radius=0.1)
     factor = [disc.path(ONE, hand_paths(), torch.tensor([s])).item() for s in (0, 1)]
     assert factor == pytest.approx([0.4, 1.0], abs=1e-3)
-    # A surfel before the disc is not hidden; confocal spots lose light both ways; half of it gets through at the disc's rim.
+    # A surfel before the disc is not hidden; confocal spots lose light both ways; half of it gets through at
+    # the disc's rim.
     assert disc.path(ONE, hand_paths(centre=(0.375, 0, 0.25)), SPOT).item() == pytest.approx(1.0, abs=1e-3)
     both = effect("occlusion", scan=hand_scan([[0.5, 0, 0]]), opacity=0.6, x=0.25, y=0.0, z=0.5, radius=0.1)
     assert both.path(ONE, hand_paths(), SPOT).item() == pytest.approx(0.16, abs=1e-3)
@@ -50,7 +53,8 @@ def test_occlusion_blocks_legs_that_cross_the_disc():
 
 
 def test_wall_tilt_shortens_legs():
-    # Spot at X = 0.4 of a scan centred on 0.1: X from its centre is 0.3, z = 0.02 · 0.3 = 6 mm. Leg (-0.3, 0, 0.4): cos = 0.8.
+    # Spot at X = 0.4 of a scan centred on 0.1: X from its centre is 0.3, z = 0.02 · 0.3 = 6 mm. Leg (-0.3, 0,
+    # 0.4): cos = 0.8.
     scan = hand_scan([[0.4, 0.0, 0.0], [-0.2, 0.0, 0.0]])
     scan = dataclasses.replace(scan, places=(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]),), half=0.3)
     tilt = effect("wall_tilt", scan=scan, tilt_x=0.02)

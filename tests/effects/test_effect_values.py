@@ -199,7 +199,9 @@ def test_splines_sum_to_one_and_are_smooth():
 
 
 def test_smooth_maps_do_not_hang_on_rounding():
-    """On a square scan half-waves along x and along y would be equally smooth, and any mixture of them an answer."""
+    """On a square scan half-waves along x and along y would be equally smooth, and any mixture of them an
+    answer.
+    """
     u = torch.linspace(-1, 1, 24, dtype=torch.float64)
     place = torch.stack(torch.meshgrid(u, u, indexing="ij"), -1).reshape(-1, 2)
     noise = torch.randn(place.shape, generator=torch.Generator().manual_seed(2), dtype=torch.float64)

@@ -20,7 +20,9 @@ BIN, T_START, N_BINS = 0.01, 0.5, 400
 
 
 def valley(confocal: bool, per_side: int = 8, opening: float = 1.0) -> tuple[Capture, SurfelModel]:
-    """Two plates that meet in a valley (a ridge for a negative opening), one of them darker, over a 5 × 3 scan."""
+    """Two plates that meet in a valley (a ridge for a negative opening), one of them darker, over a 5 × 3
+    scan.
+    """
     xy = np.stack(
         np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.2, 0.3, 3), indexing="ij"), -1
     ).reshape(-1, 2)
@@ -41,7 +43,9 @@ def valley(confocal: bool, per_side: int = 8, opening: float = 1.0) -> tuple[Cap
 
 
 def all_pairs(capture: Capture, model: SurfelModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Energy, mean arrival (m) and its standard deviation for each spot, from ρ_a ρ_b/π · form factors, in numpy."""
+    """Energy, mean arrival (m) and its standard deviation for each spot, from ρ_a ρ_b/π · form factors, in
+    numpy.
+    """
     centre, normal, albedo = (
         t.detach().double().numpy() for t in (model.centre(), model.normal(), model.albedo())
     )

@@ -1,4 +1,6 @@
-"""The march with tensors of fixed size against the other one, and an iteration that never needs a value on the host."""
+"""The march with tensors of fixed size against the other one, and an iteration that never needs a value on
+the host.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +76,9 @@ def test_too_little_room_is_noticed_and_made():
 
 
 def test_an_iteration_needs_no_value_on_the_host(monkeypatch):
-    """On the meta device tensors have no values: whatever waits for one fails, and so does a copy of numbers from the host."""
+    """On the meta device tensors have no values: whatever waits for one fails, and so does a copy of numbers
+    from the host.
+    """
     made = world("fine")
     made.pipeline.geometry.wants_static = True
     loss_and_gradients(made)  # finds the capacity

@@ -40,7 +40,9 @@ def test_ray_grid_is_shirley_and_chius_map(n):
 
 
 def test_every_cell_has_the_same_solid_angle():
-    """Area element |∂d/∂a × ∂d/∂b| is π/2 everywhere (2π over the square's area 4), so a cell of n × n covers 2π/n²."""
+    """Area element |∂d/∂a × ∂d/∂b| is π/2 everywhere (2π over the square's area 4), so a cell of n × n covers
+    2π/n².
+    """
     square = (torch.rand(2000, 2, dtype=DOUBLE, generator=torch.manual_seed(0)) * 2 - 1) * 0.999
     square = square[(square[:, 0].abs() - square[:, 1].abs()).abs() > 1e-3].requires_grad_()
     direction = square_to_hemisphere(square)
@@ -65,7 +67,9 @@ def test_inverse():
 
 
 def pairs(count: int, seed: int):
-    """Random pairs of directions of the hemisphere, at log-uniform angles down to a thousandth, and the angles."""
+    """Random pairs of directions of the hemisphere, at log-uniform angles down to a thousandth, and the
+    angles.
+    """
     generator = torch.manual_seed(seed)
     first = torch.randn(count, 3, dtype=DOUBLE, generator=generator)
     first[: count // 2, 2] *= 0.02  # many close to the horizon, where the map stretches most

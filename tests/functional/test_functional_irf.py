@@ -48,7 +48,9 @@ def test_cdf_is_scipys(shape, sigma):
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_cdf_and_gradients_are_exact(shape):
-    """Value and both derivatives against 60 digits; derivatives in units of what they change by over one σ and one 1/κ."""
+    """Value and both derivatives against 60 digits; derivatives in units of what they change by over one σ
+    and one 1/κ.
+    """
     sigma, kappa = 0.7, shape / 0.7
     s, k = (torch.tensor(v, dtype=DOUBLE, requires_grad=True) for v in (sigma, kappa))
     for t in times(sigma, kappa)[::6]:

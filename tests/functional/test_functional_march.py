@@ -18,7 +18,9 @@ def lattice(origin, pitch, shape) -> Lattice:
 
 
 def dense(volume, grid: Lattice, origins, frames, rays, threshold, step, reach, far=None):
-    """Every sample of every ray out to where nothing can be left; (ray line, sample number) of those near the ray's maximum."""
+    """Every sample of every ray out to where nothing can be left; (ray line, sample number) of those near the
+    ray's maximum.
+    """
     direction = torch.einsum("sij,rj->sri", frames, rays)
     far = (
         far
@@ -122,7 +124,9 @@ def test_brick_barely_above_the_horizon_of_a_tilted_wall():
 
 
 def test_threshold_edges():
-    """An intensity equal to the threshold is a surface (all numbers are exact in binary), one just below is not."""
+    """An intensity equal to the threshold is a surface (all numbers are exact in binary), one just below is
+    not.
+    """
     grid = lattice([-0.0625, -0.0625, 0.25], [0.125, 0.125, 0.125], (2, 2, 2))
     volume = torch.full((2, 2, 2), 0.25)
     rays = torch.tensor([[0.0, 0.0, 1.0]])

@@ -1,4 +1,6 @@
-"""Phasor imaging's pieces: spectra, the basis of virtual pulses, propagation by FFT and by direct sum, the magnitude's gradient."""
+"""Phasor imaging's pieces: spectra, the basis of virtual pulses, propagation by FFT and by direct sum, the
+magnitude's gradient.
+"""
 
 from __future__ import annotations
 
@@ -155,7 +157,9 @@ def test_propagation_is_the_sum_written_out(name):
 
 
 def test_no_circular_wrap_around():
-    """A single lit aperture point at one edge: the far edge sees exactly 1/R² of it, not a copy from around the corner."""
+    """A single lit aperture point at one edge: the far edge sees exactly 1/R² of it, not a copy from around
+    the corner.
+    """
     scan = Scan(mx=6, my=5, offset=(0, 0))
     scan.field = torch.zeros_like(scan.field)
     scan.field[0, 2, 0, 0] = 1

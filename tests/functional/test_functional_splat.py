@@ -21,7 +21,9 @@ def splat(times, sigma, normalise=True, bins=40):
 
 
 def test_by_hand():
-    """σ = 1/√2 at the centre of bin 5: weights 1, e⁻¹, e⁻⁴, e⁻⁹ by distance; half-way between two bins they share alike."""
+    """σ = 1/√2 at the centre of bin 5: weights 1, e⁻¹, e⁻⁴, e⁻⁹ by distance; half-way between two bins they
+    share alike.
+    """
     found = splat([5.5, 6.0], 0.5**0.5, normalise=False)
     weights = torch.exp(-(torch.arange(4, dtype=torch.float64) ** 2))
     assert torch.allclose(found[0, 5:9], weights, rtol=1e-12)
@@ -48,7 +50,9 @@ def test_ripple_of_the_unit_peak_gaussian(sigma, ripple):
 
 @pytest.mark.parametrize(("sigma", "worst"), [(0.425, 6.4e-2), (0.62, 2.44e-3), (1.3, 0)])
 def test_centroid(sigma, worst):
-    """Off by up to 4πσ² e^{-2π²σ²} (Poisson summation): 0.064 bin at σ = 0.425, 0.0024 at 0.62; beyond, by the cut at 4.5σ."""
+    """Off by up to 4πσ² e^{-2π²σ²} (Poisson summation): 0.064 bin at σ = 0.425, 0.0024 at 0.62; beyond, by
+    the cut at 4.5σ.
+    """
     centres = torch.arange(40, dtype=torch.float64) + 0.5
     error = ((splat(20 + PHASE, sigma) @ centres) - 20 - PHASE).abs().max().item()
     assert error == pytest.approx(worst, rel=0.01, abs=2e-5)

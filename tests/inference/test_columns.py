@@ -81,7 +81,9 @@ def unit(n: int, k: int) -> Tensor:
 @pytest.mark.parametrize("accepted", ACCEPTED)
 @pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
 def test_nuisance_is_the_slope_of_the_render(kind, accepted):
-    """Albedos in units of themselves, depths in bins, tilts of all normals, response, effects accepted before."""
+    """Albedos in units of themselves, depths in bins, tilts of all normals, response, effects accepted
+    before.
+    """
     model, extension, _, spots = setting(kind, accepted)
     m = len(model)
     counts = torch.full((4, 58), 3.0)
@@ -124,7 +126,9 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
 
 
 def test_smooth_tilts_lean_many_surfels_together():
-    """More than fifty surfels lean by smooth functions of their place, orthonormal, each with the prior of a tenth of a radian."""
+    """More than fifty surfels lean by smooth functions of their place, orthonormal, each with the prior of a
+    tenth of a radian.
+    """
     model, extension, _, spots = setting("confocal", number=56)
     fields = tilt_fields(model)
     f, m = fields.shape[1], len(model)
@@ -161,7 +165,9 @@ def test_batches_of_spots_change_nothing(monkeypatch):
 
 @pytest.mark.parametrize("name", [e.name for e in EFFECTS])
 def test_effect_columns_are_the_slope_of_the_render(name):
-    """At values away from the null, beside two effects that were accepted before; amplitudes first, then shapes."""
+    """At values away from the null, beside two effects that were accepted before; amplitudes first, then
+    shapes.
+    """
     model, extension, scan, spots = setting("exhaustive", "gain and pile-up")
     extension = Extension([e for e in extension.effects if e.name != name])
     effect = uneven(effect_of(name, scan)).double()

@@ -1,4 +1,6 @@
-"""The diagnose command as a user runs it: a subprocess on a reduced scene, a finished run, and what cannot work."""
+"""The diagnose command as a user runs it: a subprocess on a reduced scene, a finished run, and what cannot
+work.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Parameters of accepted effects and their errors, against dense algebra and by hand; what the diagnosis makes of them."""
+"""Parameters of accepted effects and their errors, against dense algebra and by hand; what the diagnosis
+makes of them.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,8 @@ def known(effects: list[Effect], covariance: Tensor) -> Uncertainty:
 
 
 def test_delta_method_by_hand():
-    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01 raw}: slope 0.01 P.
+    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01
+    raw}: slope 0.01 P.
 
     Small errors, so that nothing bends.
     """
@@ -55,7 +58,9 @@ def test_delta_method_by_hand():
 
 
 def test_the_length_of_a_vector_is_unsure_where_its_largest_component_is():
-    """Coefficients (0, 3) steps with errors 2 and 0.1 steps: over three errors the length goes from 3 to √(9 + 36)."""
+    """Coefficients (0, 3) steps with errors 2 and 0.1 steps: over three errors the length goes from 3 to √(9
+    + 36).
+    """
     drift = effect_of("power_drift", SCAN)
     scale = drift.declared["drift"].scale
     values = torch.zeros(drift.declared["drift"].size)
@@ -97,7 +102,9 @@ def test_hot_spots_are_counted_for_the_whole_scan():
 
 
 def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, Tensor, Tensor]:
-    """64 spots in 16 blocks with a gain and pile-up at their true values; counts drawn, or exactly expected with no seed."""
+    """64 spots in 16 blocks with a gain and pile-up at their true values; counts drawn, or exactly expected
+    with no seed.
+    """
     scene = capture_of(raster(8))
     model, scan = surfels(scene, level=40.0), Scan.of(scene)
     extension = Extension(
@@ -115,7 +122,9 @@ def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, 
 
 
 def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Effects' block of the inverse of the whole information matrix; their columns and the residual off the nuisance."""
+    """Effects' block of the inverse of the whole information matrix; their columns and the residual off the
+    nuisance.
+    """
     problem = build_problem(fit.model, fit.extension, spots, fit.counts, with_effects=False)
     z = torch.cat([weighted_columns(problem, e) for e in fit.extension.effects], 1).double()
     x = problem.nuisance.double()
@@ -257,7 +266,9 @@ def test_names_fall_where_more_is_left_than_they_explain():
 
 
 def test_names_fall_where_they_leave_much_of_their_own_kind():
-    """Two effects, predicted to gain 100 nats each on 160 tested spots, that gained ten times as much as they left."""
+    """Two effects, predicted to gain 100 nats each on 160 tested spots, that gained ten times as much as they
+    left.
+    """
     left = [discrepancy("scan", 100), discrepancy("time", 40)]
     for scan, dominates in (
         (270, True),
@@ -276,7 +287,9 @@ def test_names_fall_where_they_leave_much_of_their_own_kind():
 
 
 def test_toys_speak_against_what_theory_lets_pass():
-    """A tail of statistic 30: theory says 1e-6, toys of 25 ± 5 say 0.16. What theory had not asked for they cannot take back."""
+    """A tail of statistic 30: theory says 1e-6, toys of 25 ± 5 say 0.16. What theory had not asked for they
+    cannot take back.
+    """
     found = Candidate(effect_of("irf_tail", SCAN), 30.0, 1e-6, 0.4, 12.0, None, None, {}, None)
     assert weighed(found, None, 1e-3) == (1e-6, False)
     p, feigned = weighed(found, Null(40, {"irf_tail": (25.0, 25.0)}, []), 1e-3)

@@ -70,7 +70,9 @@ def test_own_is_half_the_squared_change(scene):
 
 
 def test_a_ripple_that_stands_for_a_gap_has_not(scene):
-    """Five codes lose 60 %; of all ripples with half a period there, the one with the best strength is in the model."""
+    """Five codes lose 60 %; of all ripples with half a period there, the one with the best strength is in the
+    model.
+    """
     factor = torch.ones(scene.n_spots, scene.gate[1] - scene.gate[0])
     factor[:, 20:25] = 0.4
     scan = Scan.of(scene)
@@ -91,7 +93,9 @@ def test_a_number_for_every_spot_has_no_common_strength(scene):
 
 
 def test_a_wall_that_is_dark_where_the_scene_is_bright_belongs_to_the_counting(scene):
-    """A map with minus half the logarithm of the scene's own totals, smooth; its mirror image, which no detector makes; its own."""
+    """A map with minus half the logarithm of the scene's own totals, smooth; its mirror image, which no
+    detector makes; its own.
+    """
     scan, model = Scan.of(scene), surfels(scene)
     wall = effect_of("wall_reflectance", scan)
     rate = model.expected(torch.arange(scene.n_spots)).sum(1).log()

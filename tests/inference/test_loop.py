@@ -1,4 +1,6 @@
-"""The loop: effects are accepted one after the other, taken back where their form is wrong, dropped where they became needless."""
+"""The loop: effects are accepted one after the other, taken back where their form is wrong, dropped where
+they became needless.
+"""
 
 from __future__ import annotations
 
@@ -109,7 +111,9 @@ def accepting(names: list[str], left: list) -> Turn:
 
 
 def test_the_loop_ends_with_nothing_or_with_enough(monkeypatch):
-    """Each turn accepts the next effect: at most ``most``, then one last look; dropped ones no longer count as accepted."""
+    """Each turn accepts the next effect: at most ``most``, then one last look; dropped ones no longer count
+    as accepted.
+    """
     rest = [SimpleNamespace(axis="time")]
 
     def turn(fit, rebuild, split, scan, s, seed, steps, latest) -> Turn:

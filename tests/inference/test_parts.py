@@ -107,7 +107,9 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
 
 
 def pulse_capture(side: int = 8, decays: tuple[float, float] = (0.1, 0.25), gains: np.ndarray | None = None):
-    """A direct pulse before a gate that begins at bin 160, slower from 1/200 of its peak on; spots' energies by ``gains``."""
+    """A direct pulse before a gate that begins at bin 160, slower from 1/200 of its peak on; spots' energies
+    by ``gains``.
+    """
     t = (np.arange(200) - 10) * BIN
     knee = decays[0] * np.log(200)
     tail = np.where(
@@ -197,7 +199,9 @@ def test_numerics_move_nothing_but_numbers():
 
 @pytest.fixture(scope="module")
 def residuals():
-    """A wall twice as wide as high, with a fifth more light than expected in bins 30 … 33 and at spots x > 0.4."""
+    """A wall twice as wide as high, with a fifth more light than expected in bins 30 … 33 and at spots x >
+    0.4.
+    """
     scene = capture_of(raster(24, 12))
     model, scan = surfels(scene), Scan.of(scene)
     factor = torch.ones(288, 58)
@@ -240,7 +244,9 @@ def test_time_profile_by_hand(residuals):
 
 
 def test_wall_profile_is_in_the_world_and_blank_where_no_spots_are(residuals):
-    """The scan spans x from -0.3 to 0.5 and y from -0.24 to 0.14 m: its square reaches as far along y as along x."""
+    """The scan spans x from -0.3 to 0.5 and y from -0.24 to 0.14 m: its square reaches as far along y as
+    along x.
+    """
     found, measured, scan, _ = residuals
     wall = found["wall"]
     assert scan.centre.tolist() == pytest.approx([0.1, -0.05])

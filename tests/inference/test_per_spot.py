@@ -19,7 +19,9 @@ pytestmark = FORWARD_MODE
 
 
 def scores(delta: np.ndarray, seed: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Scores and information of spots with coefficients ``delta``, some measured twenty times better than others."""
+    """Scores and information of spots with coefficients ``delta``, some measured twenty times better than
+    others.
+    """
     rng = np.random.default_rng(seed)
     information = rng.uniform(0.5, 10, len(delta))
     return torch.from_numpy(
@@ -66,7 +68,9 @@ def test_width_and_share_of_a_sparse_one():
 
 
 def test_pure_noise_has_no_width():
-    """It gains less than half a nat on average, as a number on the edge of its range does (½ χ² half of the time)."""
+    """It gains less than half a nat on average, as a number on the edge of its range does (½ χ² half of the
+    time).
+    """
     for positive in (False, True):
         gains = [best_width(*scores(np.zeros(300), seed=k), positive)[0] for k in range(30)]
         assert min(gains) >= 0
@@ -127,7 +131,9 @@ def test_solve_finds_every_spots_delay_and_their_width():
 
 
 def test_unseen_spots_still_say_whether_the_width_is_right():
-    """Log-likelihood of spots that were not solved: marginal over their coefficients, so that jitter gains without knowing any."""
+    """Log-likelihood of spots that were not solved: marginal over their coefficients, so that jitter gains
+    without knowing any.
+    """
     scene = capture_of(raster(8))
     model, scan = surfels(scene, level=40.0), Scan.of(scene)
     delays = 0.02 * torch.from_numpy(np.random.default_rng(2).standard_normal(64)).float()

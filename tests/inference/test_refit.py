@@ -50,7 +50,9 @@ def trial(name: str, likelihood: Tensor, gain: float, **options) -> Trial:
 
 
 def test_comparison_by_hand():
-    """Blocks gain 3, -1 and 4: six nats. Of a resampled sum of three the variance is three times that of the blocks."""
+    """Blocks gain 3, -1 and 4: six nats. Of a resampled sum of three the variance is three times that of the
+    blocks.
+    """
     before = torch.tensor([1.0, 1, 1, 1, 1, 1], dtype=torch.float64)
     after = before + torch.tensor([1.0, -1, 2, 4, 0.5, -0.5])
     found = compare(before, after, np.array([7, 3, 7, 9, 9, 9]))
@@ -106,7 +108,9 @@ def test_a_step_moves_all_amplitudes_in_order():
 
 
 def test_fewest_parameters_win_a_tie():
-    """One parameter, half a nat behind thirty: the same within its error. Ten nats behind with little scatter: not."""
+    """One parameter, half a nat behind thirty: the same within its error. Ten nats behind with little
+    scatter: not.
+    """
     best = per_spot(2.0, 0.5)
     wide = trial("wall_reflectance", best, 240)
     near = trial("vignetting", best - per_spot(0.02, 0.1, seed=1), 237.6)
@@ -176,8 +180,9 @@ def test_significance_is_holms():
 
 
 def test_what_is_significant_must_gain_enough():
-    """25 nats for what moves or scales the light, as the base's own errors do; 15 for all others; more of a rebuilt scene where
-    little is retained."""
+    """25 nats for what moves or scales the light, as the base's own errors do; 15 for all others; more of a
+    rebuilt scene where little is retained.
+    """
     settings = CriticismSettings()
     few = [
         candidate("vignetting", gain=26),
@@ -244,7 +249,9 @@ def test_a_refit_begins_at_the_step_and_leaves_the_fit_alone():
     "name", [None, "afterpulsing", "direct_leak", "background_slope", "ambient_map", "gate_edges", "pile_up"]
 )
 def test_a_rebuild_begins_at_the_right_brightness(name):
-    """Seeds have an intensity of 1, so that at first the background is all: what an effect makes of it is no light of the scene."""
+    """Seeds have an intensity of 1, so that at first the background is all: what an effect makes of it is no
+    light of the scene.
+    """
     scene = capture_of(raster(12))
     values = {"gate_edges": {"start": 0.5, "end": 0.5, "width": 20.0}, "pile_up": {"detections": 0.1}}
     effects = [] if name is None else [uneven(effect_of(name, Scan.of(scene), **values.get(name, {})))]

@@ -1,4 +1,6 @@
-"""Score tests on a linear Gaussian toy where the answer is known: 40 spots of 6 bins, seven columns of nuisance."""
+"""Score tests on a linear Gaussian toy where the answer is known: 40 spots of 6 bins, seven columns of
+nuisance.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +110,9 @@ def no_priors(monkeypatch):
 
 @pytest.mark.parametrize(("name", "k"), [("power_drift", 5), ("time_offset", 1)])
 def test_statistic_of_nothing_is_chi_squared(name, k, no_priors):
-    """Mean k and variance 2k within four standard errors; gains of nothing average to -½ Σ tr(F_b F₋b⁻¹) = -0.6 k."""
+    """Mean k and variance 2k within four standard errors; gains of nothing average to -½ Σ tr(F_b F₋b⁻¹) =
+    -0.6 k.
+    """
     found = [look(name, r) for r in residuals(torch.zeros(ROWS), seed=3)]
     statistics = np.array([c.statistic for c in found])
     assert abs(statistics.mean() - k) < 4 * math.sqrt(2 * k / DRAWS)
@@ -120,7 +124,9 @@ def test_statistic_of_nothing_is_chi_squared(name, k, no_priors):
 
 
 def test_priors_cost_little_where_nothing_is_and_win_where_the_counts_say_little():
-    """The statistic is that of free coefficients; the predicted gain is that of steps which the prior holds back."""
+    """The statistic is that of free coefficients; the predicted gain is that of steps which the prior holds
+    back.
+    """
     draws = residuals(torch.zeros(ROWS), seed=3)
     found = [look("power_drift", r) for r in draws]
     assert np.mean([c.statistic for c in found]) == pytest.approx(5, abs=4 * math.sqrt(10 / DRAWS))
@@ -162,7 +168,9 @@ def test_retained_information_is_what_the_base_leaves():
 
 
 def test_p_value_pays_for_every_shape():
-    """Many periods, a pair of columns each: the best of them alone would pass at a level of 5 % in most draws."""
+    """Many periods, a pair of columns each: the best of them alone would pass at a level of 5 % in most
+    draws.
+    """
     shapes = len(effect_of("tcspc_nonlinearity", SCAN).shape_grid())
     found = [look("tcspc_nonlinearity", r) for r in residuals(torch.zeros(ROWS), seed=5)]
     unpaid = np.array([stats.chi2.sf(c.statistic, 2) for c in found])
@@ -192,7 +200,9 @@ def test_amplitudes_stay_in_their_bounds():
 
 
 def test_bounds_do_not_hide_a_smooth_field(monkeypatch):
-    """Two columns that nearly cancel, pulled apart beyond their bounds: clipped, their balance is lost; held back, it is not."""
+    """Two columns that nearly cancel, pulled apart beyond their bounds: clipped, their balance is lost; held
+    back, it is not.
+    """
     common, tiny = normal(ROWS, seed=11), normal(ROWS, seed=12)
     five = torch.stack([common, common + 1e-3 * tiny, *normal(ROWS, 3, seed=13).unbind(1)], 1)
     monkeypatch.setattr(screening, "weighted_columns", lambda *_, **__: five)
@@ -244,7 +254,9 @@ def test_screening_ranks_by_gain():
 
 
 def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
-    """Column 1 at every bin of a spot, F = 6 a spot: δ ~ N(0, 1.5²) is seen as an excess of scatter, and no scatter as none."""
+    """Column 1 at every bin of a spot, F = 6 a spot: δ ~ N(0, 1.5²) is seen as an excess of scatter, and no
+    scatter as none.
+    """
     monkeypatch.setattr(screening, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
     delta = 1.5 * normal(SPOTS, seed=12)
     truth = delta.repeat_interleave(BINS)

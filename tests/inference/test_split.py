@@ -111,7 +111,9 @@ def test_no_discrepancy_in_counts_of_the_model_itself(scene):
 @FORWARD_MODE
 @pytest.mark.parametrize("axis", BANDS)
 def test_a_misfit_is_seen_on_its_axis(scene, axis):
-    """Five bins too few codes, a checkerboard on the wall, a ripple along the scan (whose order is random), bright spots dimmed."""
+    """Five bins too few codes, a checkerboard on the wall, a ripple along the scan (whose order is random),
+    bright spots dimmed.
+    """
     plain, scan = weighed(scene)
     factor = torch.ones_like(plain.expected)
     if axis == "time":
@@ -157,7 +159,9 @@ def test_bands_follow_irregular_spots():
 
 @FORWARD_MODE
 def test_stretches_of_a_raster_are_not_taken_for_a_map_of_the_wall(scene):
-    """The second half of a raster is half of the wall, too (and gains more as such here); a checkerboard is the wall's alone."""
+    """The second half of a raster is half of the wall, too (and gains more as such here); a checkerboard is
+    the wall's alone.
+    """
     raster = dataclasses.replace(scene, scan_order=np.arange(scene.n_spots))
     scan = Scan.of(raster)
     cell = ((scan.places[0] + 1) * 4).long().clamp_max(7).sum(1)
@@ -173,7 +177,9 @@ def test_stretches_of_a_raster_are_not_taken_for_a_map_of_the_wall(scene):
 
 @FORWARD_MODE
 def test_what_the_base_can_imitate_is_no_degree_of_freedom(scene):
-    """The common factor of all counts is the scene's own; rounding errors of its score may not be taken for a gain."""
+    """The common factor of all counts is the scene's own; rounding errors of its score may not be taken for a
+    gain.
+    """
     problem, _ = weighed(scene, 1.3)
     projector, (spots, bins) = Projector(problem), problem.expected.shape
     imitated = problem.nuisance[:, :1].view(spots, bins, 1)

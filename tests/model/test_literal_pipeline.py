@@ -1,4 +1,6 @@
-"""The whole pipeline and its gradients against the paper's equations written out (tests/literal.py), on small asymmetric scenes."""
+"""The whole pipeline and its gradients against the paper's equations written out (tests/literal.py), on small
+asymmetric scenes.
+"""
 
 from __future__ import annotations
 
@@ -163,7 +165,9 @@ PRECISION_CASES = ("confocal", "one laser", "curved wall")
 
 @pytest.mark.parametrize("name", PRECISION_CASES)
 def test_half_precision_storage(name):
-    """Measured: |u| to 5e-4 (7e-4 on the curved wall), H_R to 3e-3; Θ_pf's gradient keeps its direction and a few per cent."""
+    """Measured: |u| to 5e-4 (7e-4 on the curved wall), H_R to 3e-3; Θ_pf's gradient keeps its direction and a
+    few per cent.
+    """
     case = CASES[name]
     world = build(case)
     half = run_package(world, torch.float16)
@@ -214,7 +218,9 @@ def imaging_at(world: SimpleNamespace, omega_pf: float, sigma_pf: float) -> floa
 
 
 def test_imaging_equals_the_virtual_pulse_in_time_but_for_frequencies_below_zero():
-    """Eq. 2 has all frequencies; the package leaves out those at and below zero, where a pulse of few cycles has weight."""
+    """Eq. 2 has all frequencies; the package leaves out those at and below zero, where a pulse of few cycles
+    has weight.
+    """
     world = build(CASES["confocal"])
     phasor = world.pipeline.phasor
     phasor.prepare(world.capture, phasor.plan(world.capture, 1 << 32))

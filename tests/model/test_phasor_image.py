@@ -76,7 +76,8 @@ def scanned(kind: str) -> tuple[np.ndarray, np.ndarray, tuple[int, ...]]:
 def test_a_scatterer_is_imaged_where_it_is(kind):
     """Within half a voxel in every direction, off-centre and with an offset first bin.
 
-    The pulse is short: the image's slope with depth shifts a maximum by an amount that grows as σ² (1 cm at σ = 0.1 m).
+    The pulse is short: the image's slope with depth shifts a maximum by an amount that grows as σ² (1 cm at σ
+    = 0.1 m).
     """
     laser, sensor, shape = scanned(kind)
     path = np.linalg.norm(laser - SCATTERER, axis=1) + np.linalg.norm(sensor - SCATTERER, axis=1)
@@ -97,7 +98,9 @@ def test_a_scatterer_is_imaged_where_it_is(kind):
 
 
 def test_everything_made_by_planning_lies_on_the_modules_device():
-    """Stands in for a GPU: on the meta device a tensor left behind on the CPU cannot be combined with the others."""
+    """Stands in for a GPU: on the meta device a tensor left behind on the CPU cannot be combined with the
+    others.
+    """
     phasor = imaging(VolumeGrid((-0.2, 0.1, 0.3), (0.1, 0.2, 0.01), (4, 4, 3))).to("meta")
     phasor.plan(Capture(**fields()), 1 << 40)
     assert phasor.omega.device.type == phasor.basis.device.type == "meta"

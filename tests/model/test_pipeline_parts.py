@@ -49,7 +49,9 @@ def rendered(surface: Surface, laser, sensor, side: int, albedo: float = 1.0) ->
 
 @pytest.mark.parametrize("distance", [0.5, 1.0])
 def test_a_small_plate_facing_the_spot(distance):
-    """K = ρ A / d⁴, all cosines 1: rays on the plate thin out as 1/d², each carries 1/d². Off the axis it is (1 + r²/d²)⁻⁴ less."""
+    """K = ρ A / d⁴, all cosines 1: rays on the plate thin out as 1/d², each carries 1/d². Off the axis it is
+    (1 + r²/d²)⁻⁴ less.
+    """
     side, half = 1401, 0.06
     energy = rendered(
         plane_seen_from([0.0, 0.0, 0.0], distance, half, side), [0.0] * 3, [0.0] * 3, side, albedo=0.6
@@ -91,7 +93,9 @@ def test_early_and_late_paths_are_outside_the_window():
 
 
 def test_points_and_normals_of_a_tilted_sheet():
-    """A thin bright sheet z = 0.6 + 0.3 x - 0.2 y: points lie on it, normals are (0.3, -0.2, -1)/|·| towards the wall."""
+    """A thin bright sheet z = 0.6 + 0.3 x - 0.2 y: points lie on it, normals are (0.3, -0.2, -1)/|·| towards
+    the wall.
+    """
     grid = VolumeGrid((-0.3, -0.3, 0.4), (0.02, 0.02, 0.005), (90, 31, 31))
     z, x, y = np.meshgrid(grid.z, grid.x, grid.y, indexing="ij")
     sheet = torch.from_numpy(np.exp(-0.5 * ((z - 0.6 - 0.3 * x + 0.2 * y) / 0.02) ** 2)).float()
@@ -143,7 +147,9 @@ def sensor(n_bins: int, sigma=1.5, kappa=0.5, splat=None, upper=20.0, lowest=0.0
 
 @pytest.mark.parametrize("n_bins", [64, 128, 512])
 def test_sensor_response_is_not_cut_before_the_transient_ends(n_bins):
-    """A pulse in bin 4 keeps its whole tail, however wide σ_ls may become; the closing bins follow the response to the end."""
+    """A pulse in bin 4 keeps its whole tail, however wide σ_ls may become; the closing bins follow the
+    response to the end.
+    """
     model = sensor(n_bins, sigma=1.5, kappa=0.2)
     transient = torch.zeros(1, n_bins)
     transient[0, 4] = 3.0

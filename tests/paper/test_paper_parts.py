@@ -1,4 +1,6 @@
-"""What experiments measure with, by hand: separation, thinning, settling, scores; what a workspace keeps and refuses."""
+"""What experiments measure with, by hand: separation, thinning, settling, scores; what a workspace keeps and
+refuses.
+"""
 
 from __future__ import annotations
 

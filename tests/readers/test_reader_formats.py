@@ -11,7 +11,8 @@ UNITS = ReaderOptions(bin_width_ps=10.0)
 CUBE = ReaderOptions(bin_width_ps=10.0, wall_size=0.8)
 C = files.C
 
-# writer, options, format, kind, scan, laser point, sensor point, path at the middle of the bright bin, bin length, value
+# writer, options, format, kind, scan, laser point, sensor point, path at the middle of the bright bin, bin
+# length, value
 TABLE = [
     ("ytal", {}, None, "ytal", "confocal", (3, 2), (0.2, -0.1), (0.2, -0.1), 0.5 + 33.5 * 0.01, 0.01, 9),
     ("lct", {}, None, "lct", "confocal", (4, 2), (0.3, 0.2), (0.3, 0.2), 300.5 * C * 4e-12, C * 4e-12, 9),
@@ -244,7 +245,8 @@ def test_the_gate_begins_behind_the_direct_pulse(tmp_path):
     scipy.io.savemat(tmp_path / "capture.mat", {"rect_data": data, "width": 0.35})
     first, last = read_capture(tmp_path / "capture.mat").gate
     assert last == 2048
-    # 3000·exp(-t/40) sinks below 1e-4 of its peak after 40·ln(10 000) = 368 bins; whole counts end after 40·ln(6000) = 348
+    # 3000·exp(-t/40) sinks below 1e-4 of its peak after 40·ln(10 000) = 368 bins; whole counts end after
+    # 40·ln(6000) = 348
     assert 320 < first < 380
 
 

@@ -49,7 +49,8 @@ def test_tals_raw_scale_is_taken_off():
     path = real_file("rendered/tal_cli_raw_z_confocal_16.hdf5")
     raw, capture = read_capture(path, options=ReaderOptions(raw_scale=False)), read_capture(path)
     ratio = raw.counts.sum(axis=1) / capture.counts.sum(axis=1)
-    # laser at (-0.5, 0, 0.25): nearest spots (-0.4375, ±0.0625) and (-0.5625, ±0.0625), furthest the corners at x = 0.9375
+    # laser at (-0.5, 0, 0.25): nearest spots (-0.4375, ±0.0625) and (-0.5625, ±0.0625), furthest the corners
+    # at x = 0.9375
     near, far = (
         np.pi * 0.25 / (dx**2 + dy**2 + 0.0625) ** 1.5 for dx, dy in ((0.0625, 0.0625), (1.4375, 0.9375))
     )
@@ -88,7 +89,9 @@ def test_lct_captures(name, sha):
 
 
 def _image(capture, depth: float, step: int, wavelength: float = 0.06) -> np.ndarray:
-    """``[x, y]`` phasor-field back-projection onto 28 × 28 points of a plane, from every ``step``-th spot along both axes."""
+    """``[x, y]`` phasor-field back-projection onto 28 × 28 points of a plane, from every ``step``-th spot
+    along both axes.
+    """
     nx, ny = capture.scan_shape
     rows = np.arange(nx * ny).reshape(nx, ny)[::step, ::step].ravel()
     first = capture.gate[0]
@@ -118,7 +121,9 @@ def _seen(image: np.ndarray) -> np.ndarray:
 
 
 def _ratio(seen: np.ndarray, stroke: tuple[slice, slice], gap: tuple[slice, slice]) -> float:
-    """How much brighter a stroke of a letter is than a place that only the mirrored or inverted letter would fill."""
+    """How much brighter a stroke of a letter is than a place that only the mirrored or inverted letter would
+    fill.
+    """
     return float(seen[stroke].mean() / seen[gap].mean())
 
 

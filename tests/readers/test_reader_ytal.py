@@ -217,7 +217,8 @@ TAL = "args:\n  command: render\nconfig:\n  bin_width_opl: 0.01\ntal_version: 0.
 )
 def test_tals_raw_scale(tmp_path, text, asked, corrected):
     capture = read_capture(files.ytal(tmp_path, scene_info=text), options=ReaderOptions(raw_scale=asked))
-    # the laser at (0, 0, 0.3) and the bright spot at (0.2, -0.1): d² = 0.14, cos = 0.3/√0.14, so π·cos/d² = 17.99
+    # the laser at (0, 0, 0.3) and the bright spot at (0.2, -0.1): d² = 0.14, cos = 0.3/√0.14, so π·cos/d² =
+    # 17.99
     assert capture.counts.max() == pytest.approx(9 / 17.99 if corrected else 9, rel=1e-3)
     assert any("raw scale" in step for step in capture.provenance["steps"]) == corrected
 
@@ -235,7 +236,8 @@ def test_huge_scene_info_with_python_tags_is_not_parsed(tmp_path):
 
 
 def test_a_wall_that_faces_elsewhere_is_turned(tmp_path):
-    # wall in the plane x = 0 facing +x, y up: seen from the wall the file's -z is to the left, which is our +x
+    # wall in the plane x = 0 facing +x, y up: seen from the wall the file's -z is to the left, which is our
+    # +x
     grid = np.stack(np.meshgrid([0.0], [-0.1, 0.1], [-0.2, 0.0, 0.2], indexing="ij"), axis=-1)[0].astype(
         np.float32
     )

@@ -1,4 +1,6 @@
-"""The report: what it says, that every number is in it, that it needs nothing but itself; figures show what they should."""
+"""The report: what it says, that every number is in it, that it needs nothing but itself; figures show what
+they should.
+"""
 
 from __future__ import annotations
 

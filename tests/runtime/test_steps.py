@@ -91,7 +91,9 @@ def test_time_left_by_hand(monkeypatch):
 
 
 def test_steps_side_by_side(tmp_path):
-    """Both at once (each waits for the other), with one thread of torch, in the order asked for; what was kept is not repeated."""
+    """Both at once (each waits for the other), with one thread of torch, in the order asked for; what was
+    kept is not repeated.
+    """
     before, meet, threads = torch.get_num_threads(), threading.Barrier(2, timeout=20), []
 
     def together(value: int) -> int:
@@ -195,7 +197,9 @@ def test_joint_steps_follow_the_columns():
 
 
 def test_the_likeliest_start_is_taken():
-    """A gain drift that the albedos have no part in starts alone; a step of the base that breaks the fit is not taken along."""
+    """A gain drift that the albedos have no part in starts alone; a step of the base that breaks the fit is
+    not taken along.
+    """
     scene = capture_of(raster(8))
     model, scan = surfels(scene, level=2.0), Scan.of(scene)
     hidden = effect_of("power_drift", scan, drift=torch.tensor([0.2, 0.1, 0.0, 0.0, 0.0]))

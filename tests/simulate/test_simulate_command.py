@@ -60,7 +60,8 @@ def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
     plain = read_capture(tmp_path / "y.hdf5")
     assert plain.counts.sum() == pytest.approx(3 * 12 * (1500 + 10), rel=0.02)
     assert plain.provenance["sensor"]["background"] == pytest.approx(0.3)
-    # Cycles that record one photon at most: 0.4 a cycle of the -ln(1 - 0.4) that arrive, if all spots were equally bright.
+    # Cycles that record one photon at most: 0.4 a cycle of the -ln(1 - 0.4) that arrive, if all spots were
+    # equally bright.
     hot = 6 * 100
     assert capture.counts.sum() == pytest.approx((plain.counts.sum() + hot) * 0.4 / -np.log(0.6), rel=0.05)
 

@@ -31,7 +31,9 @@ def scene(name: str):
 
 
 def read_render(name: str, step: int):
-    """Radiance ``[S, T]``, laser and sensor points ``[S, 3]``, bin length and stated noise, read without the project's readers."""
+    """Radiance ``[S, T]``, laser and sensor points ``[S, 3]``, bin length and stated noise, read without the
+    project's readers.
+    """
     with h5py.File(real_file(f"rendered/{name}.hdf5")) as file:
         h = file["H"][()].astype(np.float64)
         sensor = file["sensor_grid_xyz"][()].reshape(-1, 3).astype(np.float64)

@@ -1,4 +1,6 @@
-"""The effects as a measurement simulator: against the ground-truth simulator without effects, by hand with them."""
+"""The effects as a measurement simulator: against the ground-truth simulator without effects, by hand with
+them.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""Refinement of a small scene: at the noise, better than its image, repeatable, blind to held-out counts, silent on noise."""
+"""Refinement of a small scene: at the noise, better than its image, repeatable, blind to held-out counts,
+silent on noise.
+"""
 
 from __future__ import annotations
 

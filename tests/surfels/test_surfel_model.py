@@ -69,7 +69,8 @@ def random_model(quadrature=2) -> tuple[SurfelModel, torch.Tensor]:
 
 
 def test_one_surfel_by_hand():
-    # Laser (0.3, 0, 0), sensor (0, 0.4, 0), surfel at (0, 0, 0.4): d1 = 0.5, d2 = √0.32, all cosines are 0.4/d.
+    # Laser (0.3, 0, 0), sensor (0, 0.4, 0), surfel at (0, 0, 0.4): d1 = 0.5, d2 = √0.32, all cosines are
+    # 0.4/d.
     model = build(wall([[0.3, 0.0, 0.0]], [[0.0, 0.4, 0.0]]), [[0.0, 0.0, 0.4]])
     paths = model.paths(torch.tensor([0]))
     d1, d2 = 0.5, math.sqrt(0.32)
@@ -110,7 +111,9 @@ def test_splat_drops_what_leaves_the_window():
 
 
 def test_plate_has_the_simulators_transients():
-    """The independent simulator carries ρ_w²ρ_p/π³ and bins without a splat: compare energies, means and variances per spot."""
+    """The independent simulator carries ρ_w²ρ_p/π³ and bins without a splat: compare energies, means and
+    variances per spot.
+    """
     scan = ScanPlan(
         kind="single", nx=4, ny=3, width=1.0, height=0.6, fixed_point=(0.2, -0.1), bin_length=0.01, n_bins=300
     )

@@ -1,4 +1,6 @@
-"""Two processes that share the phasor field: same volume, loss and gradients as one, bytes as stated, and what cannot work."""
+"""Two processes that share the phasor field: same volume, loss and gradients as one, bytes as stated, and
+what cannot work.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ TOLERANCE = {
 def test_slabs_by_hand():
     assert [Slabs(7, 3, r).own for r in range(3)] == [slice(0, 2), slice(2, 4), slice(4, 7)]
     assert most_planes(7, 3) == Slabs(7, 3, 0).most == 3
-    # 10 voxels a plane, 4 bytes: 3 planes of its own (one of them to fill up) and the gradient of three such slabs
+    # 10 voxels a plane, 4 bytes: 3 planes of its own (one of them to fill up) and the gradient of three such
+    # slabs
     assert Slabs(7, 3, 0).handed_over(10) == 4 * 10 * (3 + 9)
 
 

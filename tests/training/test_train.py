@@ -209,7 +209,9 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
 
 
 def test_two_processes_give_the_single_process_result(tmp_path):
-    """One iteration agrees to rounding. Later a ray's largest sample may flip between two near ties, so six agree to 1 %."""
+    """One iteration agrees to rounding. Later a ray's largest sample may flip between two near ties, so six
+    agree to 1 %.
+    """
     for iterations, tolerance in ((1, 1e-6), (6, 1e-2)):
         alone, together = tmp_path / f"alone{iterations}", tmp_path / f"together{iterations}"
         train(f"scene.iterations={iterations}", "logger=none", folder=alone)
