@@ -1,12 +1,13 @@
 # make run    the main job on the embedded default scene: a picture and a point cloud under outputs/
 # make test   the tests
+# make lint types   what is checked beside them: ruff, and mypy
 # Both make .venv on their first call. Another Python: make PYTHON=python3.12 test. Overrides: make run ARGS="scene=su".
 PYTHON ?= python3
 VENV ?= .venv
 ARGS ?=
 STAMP := $(VENV)/.installed
 
-.PHONY: run test slow lint clean setup results tal
+.PHONY: run test slow lint types clean setup results tal
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
@@ -18,6 +19,10 @@ slow: $(STAMP)
 
 lint: $(STAMP)
 	$(VENV)/bin/python -m ruff check .
+	$(VENV)/bin/python -m ruff format --check .
+
+types: $(STAMP)
+	$(VENV)/bin/python -m mypy
 
 # The tables and figures of docs/results.md, from what `python results.py all size=full` has left under outputs/evidence/full.
 results: $(STAMP)
@@ -37,4 +42,4 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-tal build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-tal build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
