@@ -24,9 +24,9 @@ from nlos_lit.report.style import (
     RED,
     SIGNED,
     SKY,
-    _bar,
-    _upper_time_axis,
+    colour_bar,
     styled,
+    upper_time_axis,
 )
 from nlos_lit.report.verdict import barely, invisible
 from nlos_lit.report.words import describe
@@ -107,7 +107,7 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
     unit = f" ({profile.unit})" if profile.unit and profile.axis != "time" else ""
     rows[-1].set_xlabel(LABELS.get(profile.axis, profile.axis) + unit)
     if profile.axis == "time" and bin_length:
-        _upper_time_axis(rows[0], bin_length, 1e9, "time since the start of bin 0 (ns)")
+        upper_time_axis(rows[0], bin_length, 1e9, "time since the start of bin 0 (ns)")
     return figure
 
 
@@ -127,7 +127,7 @@ def residual_wall(profile: Profile) -> Figure:
         mesh = _map(axes, values, profile.edges, profile.edges_y, cmap=SIGNED, norm=Normalize(-limit, limit))
         axes.set_title(f"{name}{_beyond(values)}", loc="left", fontsize="small")
         axes.set(xlabel=f"x ({profile.unit})", ylabel=f"y ({profile.unit})")
-    _bar(mesh, "residual (σ), 99 % inside")
+    colour_bar(mesh, "residual (σ), 99 % inside")
     return figure
 
 
@@ -353,7 +353,7 @@ def witness_maps(
         axes.set(
             xlabel="x (spots)" if ends is None else "x (m)", ylabel="y (spots)" if ends is None else "y (m)"
         )
-    _bar(mesh, "gain / mean")
+    colour_bar(mesh, "gain / mean")
     if relative[0].shape == relative[1].shape:
         panels[2].plot(
             relative[0].ravel(),

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.io.points import Points
-from nlos_lit.report import figures
+from nlos_lit.report import figures, style
 
 GRID = VolumeGrid(origin=(-0.3, -0.2, 0.5), pitch=(0.1, 0.1, 0.05), shape=(8, 7, 5))
 RNG = np.random.default_rng(5)
@@ -223,7 +223,7 @@ PLANE = Points(np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]]), np.tile([0.0, 0.0, 
     ],
 )
 def test_empty_results_still_draw(figure, tmp_path):
-    figures.save_figure(figure(), tmp_path / "figure.png")
+    style.save_figure(figure(), tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
     assert len(list(tmp_path.iterdir())) == 1
 
