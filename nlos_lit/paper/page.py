@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.io.tables import markdown_table
 from nlos_lit.paper.experiments import EXPERIMENTS
-from nlos_lit.paper.record import markdown, read_record
+from nlos_lit.paper.record import read_record
 
 GLANCE = "glance"
 ORDER = (
@@ -86,7 +87,7 @@ def section(name: str, record: dict[str, Any]) -> str:
         "",
     ]
     commit = f", commit {record['git']['commit'][:10]}" if record["git"] else ""
-    lines += [markdown(record["rows"]), "", f"[At full precision](results/{name}.csv){commit}"]
+    lines += [markdown_table(record["rows"]), "", f"[At full precision](results/{name}.csv){commit}"]
     for figure, caption in record["captions"].items():
         lines += ["", f"![{name} {figure}](images/results_{name}_{figure}.png)", "", f"*{caption}*"]
     return "\n".join(lines)
@@ -96,7 +97,7 @@ def glance(records: dict[str, dict[str, Any]]) -> str:
     """Every comparison of every experiment in one table, and which experiments are not in it."""
     rows = [{"from": name, **row} for name, record in records.items() for row in record["glance"]]
     missing = [name for name in EXPERIMENTS if name not in records]
-    return markdown(rows) + (f"\n\nNot measured yet: {', '.join(missing)}." if missing else "")
+    return markdown_table(rows) + (f"\n\nNot measured yet: {', '.join(missing)}." if missing else "")
 
 
 def copy_files(folder: Path, docs: Path, record: dict[str, Any]) -> None:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from nlos_lit.io.files import whole_file, write_json
+from nlos_lit.io.files import write_json
+from nlos_lit.io.tables import Row, cell, markdown_table, write_csv
 from nlos_lit.report.style import save_figure
 from nlos_lit.training.summary import git_state
 
-Row = dict[str, Any]
 CLASSICAL = ("bp", "fbp", "lct", "dlct", "fk", "rsd")
 
 
@@ -48,7 +47,7 @@ class Glance:
         sign = -1 if self.higher else 1
         best = min(known, key=lambda name: sign * known[name]) if known else None
         mine = [value for value in (self.ours, self.refined) if _known(value)]
-        others = [value for value in (self.published, known.get(best)) if _known(value)]
+        others = [value for value in (self.published, None if best is None else known[best]) if _known(value)]
         verdict = "–"
         if mine and others:
             better, rival = (max, max) if self.higher else (min, min)
@@ -57,14 +56,14 @@ class Glance:
             "quantity": self.what,
             "data": self.data,
             "published system": self.published,
-            "best classical": f"{cell(known[best])} ({best})" if best else None,
+            "best classical": None if best is None else f"{cell(known[best])} ({best})",
             "ours, phasor surface": self.ours,
             "ours, refined": self.refined,
             "verdict": verdict,
         }
 
 
-def _known(value: float | None) -> bool:
+def _known(value: float | None) -> TypeGuard[float]:
     return value is not None and bool(np.isfinite(value))
 
 
@@ -109,7 +108,7 @@ class Evidence:
         folder.mkdir(parents=True, exist_ok=True)
         write_csv(folder / "table.csv", self.rows)
         shown = [{key: value for key, value in row.items() if key not in self.hidden} for row in self.rows]
-        (folder / "table.md").write_text(markdown(shown) + "\n", encoding="utf-8")
+        (folder / "table.md").write_text(markdown_table(shown) + "\n", encoding="utf-8")
         for name, figure in self.figures.items():
             save_figure(figure, folder / f"{name}.png")
         texts = {key: getattr(self, key) for key in ("name", "title", "paper", "here", "captions")}
@@ -122,35 +121,3 @@ class Evidence:
 def read_record(folder: Path) -> dict[str, Any]:
     """What :meth:`Evidence.write` left in ``evidence.json``."""
     return json.loads((folder / "evidence.json").read_text(encoding="utf-8"))
-
-
-def write_csv(path: Path, rows: list[Row]) -> None:
-    """A header and a line a row, at full precision; columns in the order of their first appearance."""
-    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=columns(rows))
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def columns(rows: list[Row]) -> list[str]:
-    """All keys of all rows, in the order of their first appearance."""
-    return list(dict.fromkeys(key for row in rows for key in row))
-
-
-def markdown(rows: list[Row]) -> str:
-    """The rows as a Markdown table, three digits a number."""
-    names = columns(rows)
-    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    lines += ["| " + " | ".join(cell(row.get(name)) for name in names) + " |" for row in rows]
-    return "\n".join(lines)
-
-
-def cell(value: Any) -> str:
-    """A table's cell: – where nothing is known."""
-    if value is None or (isinstance(value, float) and not np.isfinite(value)):
-        return "–"
-    if isinstance(value, bool):
-        return "✓" if value else "–"
-    if isinstance(value, float):
-        return f"{value:.3g}" if value == 0 or 1e-3 <= abs(value) < 1e5 else f"{value:.2e}"
-    return str(value).replace("|", "\\|")

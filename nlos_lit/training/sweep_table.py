@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
 from pathlib import Path
@@ -10,6 +9,8 @@ from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+
+from nlos_lit.io.tables import markdown_table, write_csv
 
 log = logging.getLogger(__name__)
 
@@ -53,14 +54,15 @@ def sweep_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
-    with (folder / "table.csv").open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    """``table.csv`` and ``table.md``, four digits a number.
+
+    Args:
+        folder: where to.
+        rows: column → value.
+    """
+    write_csv(folder / "table.csv", rows)
 
     def cell(value: Any) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
-    lines = ["| " + " | ".join(rows[0]) + " |", "|" + "---|" * len(rows[0])]
-    lines += ["| " + " | ".join(cell(v) for v in row.values()) + " |" for row in rows]
-    (folder / "table.md").write_text("\n".join(lines) + "\n")
+    (folder / "table.md").write_text(markdown_table(rows, cell) + "\n")

@@ -1,4 +1,4 @@
-"""Tables, verdicts and files of an experiment, by hand."""
+"""Verdicts and files of an experiment, by hand."""
 
 from __future__ import annotations
 
@@ -6,26 +6,8 @@ import csv
 
 import pytest
 
-from nlos_lit.paper.record import Evidence, Glance, cell, markdown, read_record
+from nlos_lit.paper.record import Evidence, Glance, read_record
 from nlos_lit.report.figures import loss_plot
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "–"), (float("nan"), "–"), (True, "✓"), (False, "–"), (0.0, "0"), (12.3456, "12.3"), (4.58e-4, "4.58e-04"),
-        (7, "7"), ("lct", "lct"), (1234567.0, "1.23e+06"),
-        ("|x|", "\\|x\\|"),
-    ],
-)  # fmt: skip
-def test_cells(value, text):
-    assert cell(value) == text
-
-
-def test_columns_of_all_rows_are_there():
-    assert markdown([{"a": 1, "b": 0.5}, {"a": 2, "c": "x"}]).splitlines() == [
-        "| a | b | c |", "|---|---|---|", "| 1 | 0.5 | – |", "| 2 | – | x |",
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -62,8 +44,9 @@ def test_the_best_classical_method_is_named():
 
 def test_an_experiment_leaves_table_figures_and_texts(tmp_path):
     rows = [{"system": "lct", "error (mm)": 1 / 3}, {"system": "ours", "error (mm)": float("nan")}]
-    Evidence("one", "Title", "paper says", "here", rows, {"curve": loss_plot({"a": [1.0, 0.5]})}, {"curve": "caption"},
-             [Glance("error", "scene", 2.0, {}, 1.0)]).write(tmp_path)  # fmt: skip
+    figures, glance = {"curve": loss_plot({"a": [1.0, 0.5]})}, [Glance("error", "scene", 2.0, {}, 1.0)]
+    made = Evidence("one", "Title", "paper says", "here", rows, figures, {"curve": "caption"}, glance)
+    made.write(tmp_path)
     with (tmp_path / "table.csv").open(encoding="utf-8") as file:
         assert float(next(csv.DictReader(file))["error (mm)"]) == 1 / 3
     assert (tmp_path / "table.md").read_text(encoding="utf-8").splitlines()[2] == "| lct | 0.333 |"
