@@ -173,23 +173,40 @@ def test_the_patterns_find_what_they_are_for():
     assert HOSTS.search("https://py" + "pi.org/simple")
 
 
+UNSAFE_MODULES = {"pickle", "_pickle", "cPickle", "cloudpickle", "dill", "marshal", "shelve", "jsonpickle"}
+UNSAFE_CALLS = {"yaml.unsafe_load", "yaml.full_load", "joblib.load", "eval", "exec"}
+
+
 def unsafe_calls(tree: ast.AST) -> list[str]:
-    """Calls through which a file could run code."""
+    """Calls, imports and base classes through which a file could run code."""
     found = []
     for node in ast.walk(tree):
-        if not isinstance(node, ast.Call):
-            continue
-        called = ast.unparse(node.func)
-        arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
-        loader = arguments.get("Loader", ast.unparse(node.args[1]) if len(node.args) > 1 else "")
-        if (
-            (called == "torch.load" and arguments.get("weights_only") != "True")
-            or (called == "yaml.load" and "Safe" not in loader)
-            or called in ("yaml.unsafe_load", "yaml.full_load", "pickle.load", "pickle.loads", "eval", "exec")
-            or arguments.get("allow_pickle") == "True"
-        ):
+        if isinstance(node, ast.Import):
+            unsafe = bool({alias.name.split(".")[0] for alias in node.names} & UNSAFE_MODULES)
+        elif isinstance(node, ast.ImportFrom):
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            unsafe = str(node.module).split(".")[0] in UNSAFE_MODULES or bool(names & UNSAFE_CALLS)
+        elif isinstance(node, ast.ClassDef):
+            unsafe = any(ast.unparse(base).endswith("Unpickler") for base in node.bases)
+        else:
+            unsafe = isinstance(node, ast.Call) and unsafe_call(node)
+        if unsafe:
             found.append(f"line {node.lineno}: {ast.unparse(node)}")
     return found
+
+
+def unsafe_call(node: ast.Call) -> bool:
+    called = ast.unparse(node.func)
+    arguments = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+    loader = arguments.get("Loader", ast.unparse(node.args[1]) if len(node.args) > 1 else "")
+    return (
+        (called == "torch.load" and arguments.get("weights_only") != "True")
+        or (called == "yaml.load" and "Safe" not in loader)
+        or called in UNSAFE_CALLS
+        or called.split(".")[0] in UNSAFE_MODULES
+        or called.split(".")[-1] in ("Unpickler", "read_pickle")
+        or arguments.get("allow_pickle", "False") != "False"
+    )
 
 
 @pytest.mark.parametrize("name", PRODUCT)
@@ -207,6 +224,27 @@ def test_no_file_that_is_read_can_run_code(name):
         ("yaml.load(f, Loader=yaml.CSafeLoader)", True),
         ("yaml.safe_load(f)", True),
         ("np.load(f, allow_pickle=True)", False),
+        ("np.load(f, allow_pickle=trusted)", False),
+        ("np.load(f, allow_pickle=False)", True),
+        ("import pickle", False),
+        ("import pickle as p", False),
+        ("from pickle import Unpickler", False),
+        ("from _pickle import loads", False),
+        ("class Reader(pickle.Unpickler): pass", False),
+        ("class Reader(Unpickler): pass", False),
+        ("pickle.Unpickler(f).load()", False),
+        ("pickle.loads(f)", False),
+        ("Unpickler(f).load()", False),
+        ("import marshal", False),
+        ("shelve.open(f)", False),
+        ("joblib.load(f)", False),
+        ("from joblib import load", False),
+        ("joblib.dump(x, f)", True),
+        ("from dill import load", False),
+        ("pd.read_pickle(f)", False),
+        ("import json", True),
+        ("from json import load", True),
+        ("from . import steps", True),
         ("model.eval()", True),
     ],
 )

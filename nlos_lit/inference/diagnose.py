@@ -16,6 +16,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings, Findings, criticise
+from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.numerics import numerics
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import split_spots
@@ -55,7 +56,7 @@ def diagnose(
             "a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first"
         )
     split, scan = split_spots(capture), Scan.of(capture)
-    steps = Steps(report, None if folder is None else folder / "steps", settings)
+    steps = Steps(report, None if folder is None else folder / "steps", settings, kinds(scan))
     steps.share({"capture": capture, "settings": pipeline.surfels})
     steps.plan(
         image=image is None,

@@ -4,17 +4,16 @@ on where it was.
 
 from __future__ import annotations
 
-import io
-import pickle
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.runtime.plain_file import Kind, not_ours, read_plain, record, write_plain
 
 T = TypeVar("T")
 SETTINGS = "settings.json"
@@ -23,39 +22,53 @@ Report = Callable[[str, float, float], None]
 SHARE = {"image": 0.3, "fit": 1.0, "screen": 1.0, "refit": 0.3, "check": 1.0}
 
 
+class Kept(NamedTuple):
+    """A step that was done, and how long it took."""
+
+    seconds: float
+    result: Any
+
+
 class Steps:
     """Does the steps of one diagnosis.
+
+    Kept results are plain files (:mod:`nlos_lit.runtime.plain_file`): reading them runs nothing of theirs.
 
     Args:
         report: called at the start of each step with what it is, seconds since the start, and seconds that
             are left (an estimate, for the turn at hand).
         folder: where results of steps are kept; None keeps nothing.
         settings: all that results depend on, as text.
+        kinds: of objects that results hold.
 
     Raises:
         UserError: other settings have made what is there.
     """
 
     def __init__(
-        self, report: Report = lambda text, passed, left: None, folder: Path | None = None, settings: str = ""
+        self,
+        report: Report = lambda text, passed, left: None,
+        folder: Path | None = None,
+        settings: str = "",
+        kinds: Sequence[Kind] = (),
     ) -> None:
         self.report, self.folder, self.settings = report, folder, settings
-        if (
-            folder is not None
-            and (folder / SETTINGS).exists()
-            and (folder / SETTINGS).read_text() != settings
-        ):
+        self.kinds = [record(Kept), *kinds]
+        made_with = None if folder is None else folder / SETTINGS
+        if made_with is not None and made_with.exists() and made_with.read_text() != settings:
             raise UserError(
-                f"{folder} holds the steps of an interrupted diagnosis with other settings; go on with the same settings, choose "
-                "another folder, or move it away"
+                f"{folder} holds the steps of an interrupted diagnosis with other settings; go on with the "
+                "same settings, choose another folder, or move it away"
             )
         self.shared: dict[str, Any] = {}
-        self.began, self.taken, self.ahead = time.monotonic(), {}, dict.fromkeys(SHARE, 0)
+        self.began, self.ahead = time.monotonic(), dict.fromkeys(SHARE, 0)
+        self.taken: dict[str, list[float]] = {}
         self.earlier = 0.0  # seconds that kept results took when they were made
 
     def share(self, objects: Mapping[str, Any]) -> None:
-        """Large objects that every result refers to; they are kept once, by whoever made them, not with each
-        result.
+        """Name large objects that every result refers to.
+
+        They are kept once, by whoever made them, not with each result.
         """
         self.shared.update(objects)
 
@@ -73,31 +86,54 @@ class Steps:
         )
         return sum(number * known.get(kind, unit * SHARE[kind]) for kind, number in self.ahead.items())
 
-    def several(self, kind: str, jobs: list[tuple[str, str, Callable[[], T]]], at_once: int) -> list[T]:
-        """Results of independent steps (text, name, make), ``at_once`` of them at a time with a single thread
-        of torch each.
+    def several(self, kind: str, jobs: Sequence[tuple[str, str, Callable[[], T]]], at_once: int) -> list[T]:
+        """Results of independent steps, several at a time with a single thread of torch each.
+
+        Args:
+            kind: of all these steps.
+            jobs: text, name and ``make`` of each, as a step is called with.
+            at_once: steps at a time.
+
+        Returns:
+            their results, in the order of ``jobs``.
         """
+
+        def done(job: tuple[str, str, Callable[[], T]]) -> T:
+            text, name, make = job
+            return self(kind, text, name, make, at_once)
+
         if at_once == 1:
-            return [self(kind, *job) for job in jobs]
+            return [done(job) for job in jobs]
         threads = torch.get_num_threads()
         torch.set_num_threads(1)
         pool = ThreadPoolExecutor(at_once, initializer=torch.set_num_threads, initargs=(1,))
         try:
-            return list(pool.map(lambda job: self(kind, *job, at_once=at_once), jobs))
+            return list(pool.map(done, jobs))
         finally:
             pool.shutdown(cancel_futures=True)
             torch.set_num_threads(threads)
 
     def __call__(self, kind: str, text: str, name: str, make: Callable[[], T], at_once: int = 1) -> T:
-        """The result of ``make``, or of an earlier call that was kept under ``name``; ``at_once`` steps go on
-        side by side.
+        """The result of a step, or of an earlier call that was kept under its name.
+
+        Args:
+            kind: a key of ``SHARE``, by which the time left is estimated.
+            text: what is reported.
+            name: that the result is kept under.
+            make: does the step.
+            at_once: steps that go on side by side.
+
+        Raises:
+            UserError: the file that was kept is damaged or foreign.
         """
-        file = None if self.folder is None else self.folder / f"{name}.pickle"
+        file = None if self.folder is None else self.folder / f"{name}.npz"
         if file is not None and file.exists():
             self.ahead[kind] = max(0, self.ahead[kind] - 1)
-            took, result = self._load(file)
-            self.earlier += took
-            return result
+            kept = read_plain(file, self.kinds, self.shared)
+            if not isinstance(kept, Kept):
+                raise not_ours(file)
+            self.earlier += kept.seconds
+            return kept.result
         self.report(text, time.monotonic() - self.began, self.left())
         began = time.monotonic()
         result = make()
@@ -105,40 +141,7 @@ class Steps:
         self.taken.setdefault(kind, []).append(took)
         self.ahead[kind] = max(0, self.ahead[kind] - 1)
         if file is not None:
-            self._keep(file, (took, result))
+            file.parent.mkdir(parents=True, exist_ok=True)
+            (file.parent / SETTINGS).write_text(self.settings)
+            write_plain(file, Kept(took, result), self.kinds, self.shared)
         return result
-
-    def _keep(self, file: Path, result: Any) -> None:
-        names = {id(value): name for name, value in self.shared.items()}
-        whole = io.BytesIO()
-        _Pickler(whole, names).dump(result)
-        file.parent.mkdir(parents=True, exist_ok=True)
-        (file.parent / SETTINGS).write_text(self.settings)
-        part = file.with_suffix(".part")
-        part.write_bytes(whole.getvalue())
-        part.rename(file)
-
-    def _load(self, file: Path) -> Any:
-        return _Unpickler(io.BytesIO(file.read_bytes()), self.shared).load()
-
-
-class _Pickler(pickle.Pickler):
-    """Writes names for shared objects."""
-
-    def __init__(self, file: io.BytesIO, names: Mapping[int, str]) -> None:
-        super().__init__(file, pickle.HIGHEST_PROTOCOL)
-        self.names = names
-
-    def persistent_id(self, obj: Any) -> str | None:
-        return self.names.get(id(obj))
-
-
-class _Unpickler(pickle.Unpickler):
-    """Puts shared objects in for their names."""
-
-    def __init__(self, file: io.BytesIO, shared: Mapping[str, Any]) -> None:
-        super().__init__(file)
-        self.shared = shared
-
-    def persistent_load(self, pid: str) -> Any:
-        return self.shared[pid]

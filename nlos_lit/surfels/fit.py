@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.metrics.transients import expected_deviance, poisson_deviance
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.growth import Candidates, prune_and_grow
+from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel
 
 Progress = Callable[[int, int], None]
@@ -102,7 +103,7 @@ class SurfelFit:
         counts: Tensor,
         train: Tensor,
         settings: RefineSettings,
-        reserve: Candidates,
+        reserve: Seeds,
         extension: Extension,
         generator: torch.Generator,
         order: Tensor,
@@ -120,6 +121,27 @@ class SurfelFit:
         return SurfelFit(
             model, *parts, extension, generator, torch.randperm(len(self.train), generator=generator)
         )
+
+    def parts(self) -> dict[str, Any]:
+        """All that the fit is made of, as :meth:`of_parts` takes it: it goes on from there to the last digit."""
+        names = ("capture", "grid", "counts", "train", "settings", "reserve", "extension", "order", "place")
+        return {name: getattr(self, name) for name in names} | {
+            "model": dict(self.model.state_dict()),
+            "generator": self.generator.get_state(),
+            "tested": self.tested,
+            "done": self.done,
+        }
+
+    @classmethod
+    def of_parts(cls, parts: dict[str, Any]) -> SurfelFit:
+        """The fit that :meth:`parts` took apart."""
+        held = dict(parts)
+        after = {name: held.pop(name) for name in ("place", "tested", "done")}
+        held["model"] = SurfelModel.from_state(held["capture"], held["model"])
+        held["generator"] = torch.Generator().set_state(held["generator"])
+        fit = cls(**held)
+        fit.place, fit.tested, fit.done = after["place"], after["tested"], after["done"]
+        return fit
 
     @torch.no_grad()
     def match_energy(self) -> None:

@@ -37,14 +37,14 @@ CHUNK = 1 << 21  # paths at a time
 EXACT = "donot_use_mm_for_euclid_dist"
 
 
-class Candidates(NamedTuple):
+class Seeds(NamedTuple):
     """Places where a surfel might be."""
 
     centre: Tensor  # [V, 3] m
     normal: Tensor  # [V, 3]
 
-    def take(self, which: Tensor) -> Candidates:
-        return Candidates(self.centre[which], self.normal[which])
+    def take(self, which: Tensor) -> Seeds:
+        return Seeds(self.centre[which], self.normal[which])
 
 
 class Score(NamedTuple):
@@ -60,7 +60,7 @@ class Score(NamedTuple):
 
 def volume_maxima(
     intensity: Tensor, grid: VolumeGrid, floor: float, per_cell: int, lateral: Lateral
-) -> tuple[Candidates, Tensor]:
+) -> tuple[Seeds, Tensor]:
     """Local maxima along z of at least ``floor`` × the volume's maximum, the ``per_cell`` largest of each
     lateral cell.
 
@@ -92,9 +92,7 @@ def volume_maxima(
     )
     depth, value = (t[:, None].expand(-1, subdivide**2).reshape(-1) for t in (depth, value))
     centre = torch.cat([cell_centres(index, lateral), depth.float()[:, None]], 1)
-    return Candidates(
-        centre, torch.tensor([0.0, 0.0, -1.0], device=value.device).expand(len(centre), 3)
-    ), value
+    return Seeds(centre, torch.tensor([0.0, 0.0, -1.0], device=value.device).expand(len(centre), 3)), value
 
 
 def cell_centres(index: Tensor, lateral: Lateral) -> Tensor:
@@ -140,7 +138,7 @@ def start_response(capture: Capture, counts: Tensor, start: LaserSensor | None) 
 
 @torch.no_grad()
 def score(
-    candidates: Candidates,
+    candidates: Seeds,
     capture: Capture,
     cell: tuple[float, float],
     points: int,
@@ -201,23 +199,21 @@ def score(
     return Score(total[0] * gain, total[1] * gain**2)
 
 
-def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Candidates:
+def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Seeds:
     """The eight places around each surfel to which its plane extends."""
     moves = torch.tensor(
         [(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if i or j], device=centre.device
     )
     shift, _ = spread(normal, cell, moves)
-    return Candidates(
-        (centre[:, None] + shift).reshape(-1, 3), normal[:, None].expand(-1, 8, 3).reshape(-1, 3)
-    )
+    return Seeds((centre[:, None] + shift).reshape(-1, 3), normal[:, None].expand(-1, 8, 3).reshape(-1, 3))
 
 
-def facings(places: Candidates) -> Candidates:
+def facings(places: Seeds) -> Seeds:
     """Each place with its own normal, facing the wall, and tilted by 60° to either side along x and y."""
     tilt = 3**0.5 * torch.tensor(TILTS, device=places.centre.device)
     menu = torch.nn.functional.normalize(torch.cat([tilt, -torch.ones_like(tilt[:, :1])], 1), dim=1)
     normals = [places.normal, *(n.expand_as(places.normal) for n in menu)]
-    return Candidates(places.centre.repeat(len(normals), 1), torch.cat(normals))
+    return Seeds(places.centre.repeat(len(normals), 1), torch.cat(normals))
 
 
 def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096) -> Tensor:
@@ -261,7 +257,7 @@ def prune_and_grow(
     model: SurfelModel,
     capture: Capture,
     grid: VolumeGrid,
-    reserve: Candidates,
+    reserve: Seeds,
     counts: Tensor,
     train: Tensor,
     tested: Tensor,
@@ -285,10 +281,10 @@ def prune_and_grow(
     low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
     sensor, cell = model.laser_sensor, tuple(model.cell.tolist())
 
-    def test(places: Candidates, points: int) -> Score:
+    def test(places: Seeds, points: int) -> Score:
         return score(places, capture, cell, points, sensor, seen, expected, spots, hooks)
 
-    present = Candidates(model.centre(), model.normal())
+    present = Seeds(model.centre(), model.normal())
     albedo = model.albedo()
     needed = albedo * (test(present, model.quadrature).information * scale).sqrt() > prune
     needed &= (present.centre[:, 2] > low) & (present.centre[:, 2] < high)
@@ -297,7 +293,7 @@ def prune_and_grow(
             "every surfel faded away during refinement: the counts hold no third-bounce light at the image's maxima"
         )
     kept, albedo = present.take(needed), albedo[needed]
-    places = Candidates(
+    places = Seeds(
         *(torch.cat(p) for p in zip(neighbour_candidates(*kept, model.cell), reserve, strict=True))
     )
     apart = APART * float(model.cell.max())

@@ -44,7 +44,7 @@ def test_a_step_is_done_once(tmp_path):
     assert len(made) == 1
     assert second["counts"] is counts
     assert torch.equal(second["own"], first["own"])
-    assert (tmp_path / "base.pickle").stat().st_size < 2000
+    assert (tmp_path / "base.npz").stat().st_size < 2000
     with pytest.raises(UserError, match="interrupted diagnosis with other settings"):
         Steps(folder=tmp_path, settings="b")
     assert Steps()("fit", "fitting", "base", make)["own"] is not None  # without a folder nothing is kept

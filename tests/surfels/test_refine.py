@@ -21,7 +21,7 @@ from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
-from nlos_lit.surfels.growth import Candidates, best_apart, neighbour_candidates, occupied, prune_and_grow
+from nlos_lit.surfels.growth import Seeds, best_apart, neighbour_candidates, occupied, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.refine import RefineSettings, refine, score_spots
 
@@ -257,7 +257,7 @@ def test_surfels_in_empty_space_die_and_missing_ones_grow(fitted):
     )
     train = torch.from_numpy(np.flatnonzero(~held))
     counts = torch.from_numpy(capture.gated_counts())[train]
-    nothing = Candidates(torch.zeros(0, 3), torch.zeros(0, 3))
+    nothing = Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
     prune_and_grow(model, capture, grid, nothing, counts, train, torch.arange(200), prune=1.5, grow=3.5)
     now = model.centre().detach()
     assert torch.cdist(ghosts, now).min() > 0.02
