@@ -20,7 +20,7 @@ from scipy.fft import next_fast_len
 from nlos_lit.baselines.resample import apply_weights, linear_weights
 from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
-from nlos_lit.capture.aperture import Lattice
+from nlos_lit.capture.aperture import ScanLattice
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
@@ -57,7 +57,7 @@ class Cone(NamedTuple):
     """
 
     values: torch.Tensor
-    lattice: Lattice
+    lattice: ScanLattice
     first: float
     step: float
 
@@ -78,7 +78,7 @@ def light_cone(capture: Capture, grid: VolumeGrid, method: str, falloff: float) 
     return Cone(values, lattice, float(edges[0]), float(step))
 
 
-def lateral_weights(lattice: Lattice, grid: VolumeGrid) -> tuple[torch.Tensor, torch.Tensor]:
+def lateral_weights(lattice: ScanLattice, grid: VolumeGrid) -> tuple[torch.Tensor, torch.Tensor]:
     """Matrices that resample from the scan's lattice to the grid, along x and along y."""
     axes = zip(
         lattice.origin[:2], lattice.pitch, lattice.shape, (grid.x, grid.y), grid.pitch[:2], strict=True

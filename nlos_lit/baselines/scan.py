@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
-from nlos_lit.capture.aperture import Lattice, find_lattice
+from nlos_lit.capture.aperture import ScanLattice, find_lattice
 from nlos_lit.capture.errors import CaptureError
 
 
-def confocal_lattice(capture: Capture, method: str) -> Lattice:
+def confocal_lattice(capture: Capture, method: str) -> ScanLattice:
     """The scan lattice of a confocal capture, for a ``method`` (its name, for the message) that works on
     nothing else.
 

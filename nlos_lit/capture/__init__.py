@@ -1,6 +1,4 @@
-"""What was measured, and where: counts, wall points, time axis, the volume imaged through them, and what is
-wrong with a file.
-"""
+"""What was measured, and where: counts, wall points and time axis, and the volume imaged through them."""
 
 from nlos_lit.capture.capture import SPEED_OF_LIGHT, Capture
 from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError

@@ -1,4 +1,7 @@
-"""The scanned wall points as a regular lattice, and the volume that is imaged through them."""
+"""The scanned wall points as an aperture: a regular lattice where they form one, and their spacing.
+
+Imaging by convolution needs the lattice; captures without one are imaged by direct sums.
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,16 @@ _TOLERANCE = 0.01  # how far a spot may lie from its lattice point, in lattice p
 
 
 @dataclass(frozen=True)
-class Lattice:
-    """Wall points on a regular planar grid: ``x_i = origin[0] + i·pitch[0]``, ``y_j = origin[1] +
-    j·pitch[1]``, ascending.
+class ScanLattice:
+    """Wall points on a regular planar grid.
+
+    Point (i, j) lies at ``x_i = origin[0] + i·pitch[0]``, ``y_j = origin[1] + j·pitch[1]``, ascending.
 
     Args:
         origin: ``(x, y, z)`` of lattice point ``(0, 0)``, m.
         pitch: ``(dx, dy)``, m, positive.
         shape: ``(nx, ny)``.
-        spots: ``[nx·ny]`` index of the capture's spot that lies on lattice point ``i·ny + j``.
+        spots: ``[nx·ny]`` int, index of the capture's spot that lies on lattice point ``i·ny + j``.
     """
 
     origin: tuple[float, float, float]
@@ -31,11 +35,25 @@ class Lattice:
     spots: np.ndarray
 
 
-def find_lattice(points: np.ndarray) -> Lattice:
-    """The regular planar lattice that ``points [S, 3]`` fill, whatever their order.
+def find_lattice(points: np.ndarray) -> ScanLattice:
+    """The regular planar lattice that wall points fill, whatever their order.
+
+    Args:
+        points: ``[S, 3]`` wall points, m; each may lie a hundredth of a pitch from its lattice point.
+
+    Returns:
+        The lattice, with S points.
 
     Raises:
-        CaptureError: they do not; the message is the reason, as the end of a sentence that names the capture.
+        CaptureError: they fill none; the message is the reason, as the end of a sentence that names the
+            capture.
+
+    Examples:
+        >>> import numpy as np
+        >>> points = np.array([[0.1, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.2, 0.0], [0.1, 0.2, 0.0]])
+        >>> lattice = find_lattice(points)
+        >>> lattice.shape, lattice.pitch, lattice.spots.tolist()
+        ((2, 2), (0.1, 0.2), [1, 2, 0, 3])
     """
     x, dx = _axis(points[:, 0], "x")
     y, dy = _axis(points[:, 1], "y")
@@ -52,7 +70,9 @@ def find_lattice(points: np.ndarray) -> Lattice:
     spots = np.argsort(cell, kind="stable")
     if not np.array_equal(cell[spots], np.arange(len(points))):
         raise CaptureError("several of its spots share one lattice position")
-    return Lattice((float(x[0]), float(y[0]), float(points[:, 2].mean())), (dx, dy), (len(x), len(y)), spots)
+    return ScanLattice(
+        (float(x[0]), float(y[0]), float(points[:, 2].mean())), (dx, dy), (len(x), len(y)), spots
+    )
 
 
 def _axis(values: np.ndarray, name: str) -> tuple[np.ndarray, float]:
@@ -70,7 +90,8 @@ def _axis(values: np.ndarray, name: str) -> tuple[np.ndarray, float]:
     if off > _TOLERANCE * pitch:
         gaps = np.diff(centres)
         raise CaptureError(
-            f"its spots are not evenly spaced along {name} (gaps between {gaps.min():.4g} and {gaps.max():.4g} m)"
+            f"its spots are not evenly spaced along {name} "
+            f"(gaps between {gaps.min():.4g} and {gaps.max():.4g} m)"
         )
     return centres, pitch
 
@@ -85,7 +106,7 @@ class ScanGeometry:
         rows: ``[L, nx·ny]`` capture rows (spots) of each scan, in the lattice's order.
     """
 
-    lattice: Lattice
+    lattice: ScanLattice
     fixed: np.ndarray | None
     rows: np.ndarray
 
@@ -94,6 +115,7 @@ def scan_geometry(capture: Capture) -> ScanGeometry | None:
     """The capture's lattice scans, or None where the direct sum is needed (curved wall, irregular spots)."""
     rows, moving, still = np.arange(capture.n_spots)[None], capture.sensor, None
     if capture.kind == "exhaustive":
+        assert capture.scan_shape is not None
         rows = rows.reshape(-1, math.prod(capture.scan_shape[2:]))
         if any(np.abs(capture.sensor[r] - capture.sensor[rows[0]]).max() > 1e-6 for r in rows):
             return None

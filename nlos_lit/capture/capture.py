@@ -9,13 +9,33 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
 from nlos_lit.capture.errors import CaptureError
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
+
+Value = TypeVar("Value")
+
+
+class Filled(Generic[Value]):
+    """A field that may be left out or given as None, and holds a value as soon as the object is made.
+
+    ``__post_init__`` puts the value there; type checkers then know that nobody reads None.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, instance: object, owner: type | None = None) -> Value:
+        # The dataclass looks for the default at the class itself, without an instance: it is None.
+        held: Any = None if instance is None else vars(instance)[self.name]
+        return held
+
+    def __set__(self, instance: object, value: Value | None) -> None:
+        vars(instance)[self.name] = value
 
 
 @dataclass(frozen=True)
@@ -46,6 +66,25 @@ class Capture:
     Raises:
         CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, or the gate
             is empty.
+
+    Examples:
+        A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:
+
+        >>> import numpy as np
+        >>> x, y = np.meshgrid([0.0, 0.1], [0.0, 0.1], indexing="ij")
+        >>> wall = np.stack([x.ravel(), y.ravel(), np.zeros(4)], axis=1)
+        >>> up = np.tile([0.0, 0.0, 1.0], (4, 1))
+        >>> counts = np.arange(16, dtype=np.uint16).reshape(4, 4)
+        >>> capture = Capture(counts, wall, wall, up, up, bin_length=0.02, gate=(1, 4), scan_shape=(2, 2))
+        >>> capture.n_spots, capture.n_bins, capture.kind
+        (4, 4, 'confocal')
+        >>> capture.path_gate
+        (0.02, 0.08)
+        >>> capture.gated_counts()[0].tolist()
+        [1.0, 2.0, 3.0]
+        >>> Capture(-counts.astype(float), wall, wall, up, up, bin_length=0.02)
+        Traceback (most recent call last):
+        nlos_lit.capture.errors.CaptureError: counts must not be negative; ...
     """
 
     counts: np.ndarray
@@ -55,9 +94,9 @@ class Capture:
     sensor_normal: np.ndarray
     bin_length: float
     t_start: float = 0.0
-    gate: tuple[int, int] | None = None
+    gate: Filled[tuple[int, int]] = Filled()
     scan_shape: tuple[int, ...] | None = None
-    scan_order: np.ndarray | None = None
+    scan_order: Filled[np.ndarray] = Filled()
     exposure_s: float | None = None
     is_counts: bool = True
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -89,7 +128,8 @@ class Capture:
         first, last = (0, bins) if self.gate is None else (int(self.gate[0]), int(self.gate[1]))
         if not 0 <= first < last <= bins:
             raise CaptureError(
-                f"the gate [{first}, {last}) leaves no bins of the capture's {bins}; give 0 <= first < last <= {bins}"
+                f"the gate [{first}, {last}) leaves no bins of the capture's {bins}; "
+                f"give 0 <= first < last <= {bins}"
             )
         object.__setattr__(self, "gate", (first, last))
         if self.scan_shape is not None:
@@ -106,10 +146,12 @@ class Capture:
 
     @property
     def n_spots(self) -> int:
+        """Number S of pairs of a laser and a sensor point."""
         return self.counts.shape[0]
 
     @property
     def n_bins(self) -> int:
+        """Number T of time bins, inside and outside the gate."""
         return self.counts.shape[1]
 
     @property
@@ -133,6 +175,7 @@ class Capture:
 
     @property
     def bin_width_ps(self) -> float:
+        """Width of a time bin, ps."""
         return self.bin_length / SPEED_OF_LIGHT * 1e12
 
     @property
@@ -147,7 +190,18 @@ class Capture:
         return self.counts[:, first:last].astype(np.float32)
 
     def with_gate(self, first: int | None = None, last: int | None = None) -> Capture:
-        """The same counts with another gate, in bins; None keeps the present end."""
+        """The same counts with another gate.
+
+        Args:
+            first: first bin that may be fitted; None keeps the present one.
+            last: bin after the last that may be fitted; None keeps the present one.
+
+        Returns:
+            A capture that shares this one's arrays.
+
+        Raises:
+            CaptureError: the gate holds no bin.
+        """
         gate = (self.gate[0] if first is None else first, self.gate[1] if last is None else last)
         return self._changed(f"gate [{gate[0]}, {gate[1]})", gate=gate)
 
@@ -155,6 +209,19 @@ class Capture:
         """Every ``factor`` neighbouring bins summed into one; a rest at the end is dropped.
 
         The gate shrinks to whole new bins, so that nothing from outside it comes in.
+
+        Raises:
+            CaptureError: ``factor`` is not between 1 and the number of bins, or no whole new bin lies inside
+                the gate.
+
+        Examples:
+            >>> import numpy as np
+            >>> one, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+            >>> counts = np.array([[1, 2, 3, 4, 5]], dtype=np.uint8)
+            >>> short = Capture(counts, one, one, up, up, bin_length=0.01, gate=(1, 5))
+            >>> wide = short.sum_bins(2)
+            >>> wide.counts.tolist(), wide.bin_length, wide.gate
+            ([[3, 7]], 0.02, (1, 2))
         """
         if factor == 1:
             return self
@@ -168,8 +235,14 @@ class Capture:
         return self._changed(step, counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
 
     def sum_spots(self, factor: int) -> Capture:
-        """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one at their mean
-        position.
+        """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one.
+
+        A sum lies at the mean of its spots' wall points and normals; rows and columns left over at the end
+        are dropped.
+
+        Raises:
+            CaptureError: there is no single scanned grid, or ``factor`` is not between 1 and the grid's
+                shorter side.
         """
         if factor == 1:
             return self
@@ -177,12 +250,14 @@ class Capture:
             raise CaptureError("only a capture with one scanned grid [nx, ny] can be down-sampled in space")
         if not 1 <= factor <= min(self.scan_shape):
             raise CaptureError(
-                f"cannot sum {factor}×{factor} spots of a {self.scan_shape[0]}×{self.scan_shape[1]} scan into one"
+                f"cannot sum {factor}×{factor} spots of a {self.scan_shape[0]}×{self.scan_shape[1]} scan "
+                "into one"
             )
-        nx, ny = (n // factor for n in self.scan_shape)
+        shape = self.scan_shape
+        nx, ny = (n // factor for n in shape)
 
         def blocks(values: np.ndarray) -> np.ndarray:
-            grid = values.reshape(*self.scan_shape, -1)[: nx * factor, : ny * factor]
+            grid = values.reshape(*shape, -1)[: nx * factor, : ny * factor]
             return grid.reshape(nx, factor, ny, factor, -1)
 
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
@@ -213,12 +288,14 @@ def _check_counts(counts: np.ndarray) -> None:
         bad = counts.size - int(np.isfinite(counts).sum())
         if bad:
             raise CaptureError(
-                f"counts hold {bad} NaN or infinite values of {counts.size}; clean the file or mask those spots"
+                f"counts hold {bad} NaN or infinite values of {counts.size}; "
+                "clean the file or mask those spots"
             )
     lowest = counts.min()
     if lowest < 0:
         raise CaptureError(
-            f"counts must not be negative; found {lowest} (background-subtracted data cannot be used as counts)"
+            f"counts must not be negative; found {lowest} "
+            "(background-subtracted data cannot be used as counts)"
         )
     if counts.max() == 0:
         raise CaptureError("every count is zero; there is nothing to reconstruct")

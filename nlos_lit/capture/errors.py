@@ -1,4 +1,4 @@
-"""The one exception a user is meant to read."""
+"""The exceptions a user is meant to read: one kind, told apart by what is wrong."""
 
 from __future__ import annotations
 

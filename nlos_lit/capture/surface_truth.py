@@ -1,4 +1,4 @@
-"""The true hidden surface, where it is known."""
+"""The true hidden surface of a scene, where it is known: depth, normals and albedo over (x, y)."""
 
 from __future__ import annotations
 
@@ -21,6 +21,12 @@ class SurfaceTruth:
 
     Raises:
         ValueError: shapes disagree, an axis is not evenly increasing, or there is no surface.
+
+    Examples:
+        >>> import numpy as np
+        >>> plane = SurfaceTruth(np.array([0.0, 0.1, 0.2]), np.array([0.0, 0.1]), np.full((3, 2), 0.5))
+        >>> plane.cell
+        (0.1, 0.1)
     """
 
     x: np.ndarray
@@ -47,4 +53,5 @@ class SurfaceTruth:
     @property
     def cell(self) -> tuple[float, float]:
         """Spacing of the lattice in x and y, m."""
-        return tuple(float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.x, self.y))
+        dx, dy = (float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.x, self.y))
+        return dx, dy

@@ -1,0 +1,1 @@
+"""Pure tensor functions that the model is made of: no state, no settings."""

@@ -1,5 +1,4 @@
-"""The march of :mod:`nlos_lit.functional.march` with tensors of fixed size, so that a GPU never waits for the
-host.
+"""The march of :mod:`nlos_lit.functional.march` with tensors of fixed size: a GPU never waits for the host.
 
 The host cannot know how many rays meet something without waiting for the device. Here it gives capacities
 instead; what was needed is counted on the device and may be read now and then. Samples and hits are those of
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
-from nlos_lit.functional.march import Lattice, brick_maximum, constants, sample_unit, unit_scale
+from nlos_lit.functional.march import VoxelLattice, brick_maximum, constants, sample_unit, unit_scale
 
 BLOCK = 16  # neighbouring samples of a ray that are taken or left together
 
@@ -23,13 +22,14 @@ BLOCK = 16  # neighbouring samples of a ray that are taken or left together
 class Capacity(NamedTuple):
     """Rows there is room for."""
 
-    blocks: int
-    rays: int
+    blocks: int  # of BLOCK samples of a ray
+    rays: int  # that meet a surface
 
 
 class StaticSamples(NamedTuple):
-    """``2·fine + 1`` samples around the maximum of each of ``capacity.rays`` rays; rows that are not ``used``
-    mean nothing.
+    """``2·fine + 1`` samples around the maximum of each of K = ``capacity.rays`` rays.
+
+    Rows that are not ``used`` mean nothing.
     """
 
     line: Tensor  # [K] spot·n² + ray
@@ -40,8 +40,20 @@ class StaticSamples(NamedTuple):
 
 
 def compact(mask: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Places of the first ``capacity`` True elements (0 behind the last), which of these rows are used, and
-    how many were True.
+    """Places of the True elements of a mask, in a tensor whose length does not depend on their number.
+
+    Args:
+        mask: ``[N]`` bool.
+        capacity: length of the result.
+
+    Returns:
+        Places ``[capacity]`` (long; 0 behind the last), which of these rows are used ``[capacity]``, and how
+        many elements were True ``[1]``.
+
+    Examples:
+        >>> import torch
+        >>> compact(torch.tensor([False, True, False, True]), capacity=3)
+        (tensor([1, 3, 0]), tensor([ True,  True, False]), tensor([2]))
     """
     rank = torch.cumsum(mask, 0)
     row = torch.where(mask & (rank <= capacity), rank - 1, capacity)
@@ -54,7 +66,7 @@ def compact(mask: Tensor, capacity: int) -> tuple[Tensor, Tensor, Tensor]:
 @torch.no_grad()
 def static_march(
     volume: Tensor,
-    lattice: Lattice,
+    lattice: VoxelLattice,
     pitch: tuple[float, float, float],
     origins: Tensor,
     world: Tensor,
@@ -64,11 +76,22 @@ def static_march(
     fine: int,
     capacity: Capacity | None,
 ) -> StaticSamples:
-    """Args as of :func:`~nlos_lit.functional.march.march`, and
+    """Find the samples around the largest on every ray that meets the threshold, within a capacity.
 
-    pitch: of the lattice, as numbers of the host.
-    world: ``[S, n·n, 3]`` directions of the rays.
-    capacity: None measures what is needed first, which waits for the device.
+    Args:
+        volume: ``[nz, nx, ny]`` intensity, scaled to a unit maximum.
+        lattice: of the volume.
+        pitch: of the lattice, m, as numbers of the host.
+        origins: ``[S, 3]`` wall points, m.
+        world: ``[S, n·n, 3]`` unit directions of the rays.
+        threshold: a ray whose largest sample is below it meets no surface.
+        step: samples lie at ``(k + ½)·step`` from the wall point, m.
+        fine: samples a step around the maximum, more than 1.
+        capacity: blocks and rays there is room for; None measures what is needed first, which waits for the
+            device.
+
+    Returns:
+        The samples, and how much room they needed; what did not fit is missing.
     """
     shape = lattice.shape
     spots, rays = world.shape[:2]
@@ -85,7 +108,8 @@ def static_march(
     blocks = math.ceil((diagonal / step + 2) / BLOCK)
 
     half = BLOCK * step / 2
-    size = tuple(max(1, round(half / abs(p))) for p in (pitch[2], pitch[0], pitch[1]))
+    deep, wide, high = (max(1, round(half / abs(p))) for p in (pitch[2], pitch[0], pitch[1]))
+    size = (deep, wide, high)
     reach = [
         math.ceil(half / (s * abs(p)) + 1e-3)
         for s, p in zip(size, (pitch[2], pitch[0], pitch[1]), strict=True)

@@ -1,6 +1,4 @@
-"""Laser-sensor response Ψ, Eq. 10, in closed form: an exponential decay convolved with a Gaussian, integrated
-over time bins.
-"""
+"""Laser-sensor response Ψ in closed form: an exponential decay convolved with a Gaussian (paper Eq. 10)."""
 
 from __future__ import annotations
 
@@ -11,11 +9,27 @@ from torch import Tensor
 
 
 def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
-    """Distribution function of ``κ e^{-κt} * N(0, σ)``: ``F(t) = Φ(t/σ) - e^{-κt + κ²σ²/2} Φ(t/σ - κσ)``.
+    """Distribution function of an exponentially modified Gaussian ``κ e^{-κt} * N(0, σ)``.
 
-    Accurate for σ and 1/κ far below or far above the spacing of ``time`` (same unit as ``sigma`` and
-    ``1/kappa``): Φ(x) of a negative x is ½ e^{-x²/2} erfcx(-x/√2), so that the huge exponential of the second
-    term meets the tiny Φ analytically, and in the left tail both terms share the factor e^{-t²/(2σ²)}.
+    ``F(t) = Φ(t/σ) - e^{-κt + κ²σ²/2} Φ(t/σ - κσ)``, accurate for σ and 1/κ far below or far above the
+    spacing of ``time``: Φ(x) of a negative x is ½ e^{-x²/2} erfcx(-x/√2), so that the huge exponential of
+    the second term meets the tiny Φ analytically, and in the left tail both terms share the factor
+    e^{-t²/(2σ²)}.
+
+    Args:
+        time: ``[…]`` times since the arrival, in any unit.
+        sigma: σ, a scalar in the same unit.
+        kappa: κ, a scalar in one over that unit.
+
+    Returns:
+        ``[…]`` in 0 … 1; differentiable in all three.
+
+    Examples:
+        >>> import torch
+        >>> one = torch.ones((), dtype=torch.float64)
+        >>> late, early = emg_cdf(torch.tensor([3.0, -30.0], dtype=torch.float64), 1e-6 * one, one).tolist()
+        >>> round(late, 5), early  # a tiny jitter leaves the bare decay: 1 - e^-3
+        (0.95021, 0.0)
     """
     scaled = time / sigma
     late = scaled - kappa * sigma
@@ -31,19 +45,48 @@ def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
 
 
 def response(sigma: Tensor, kappa: Tensor, n_bins: int, lead: int) -> Tensor:
-    """``[n_bins]`` share of Ψ that falls into each bin; bin ``lead`` is centred on the arrival time.
+    """Share of Ψ/I_l that falls into each time bin (paper Eq. 10, integrated over bins).
 
     Args:
-        sigma: σ_ls in bins; kappa: κ_s per bin.
-        n_bins: length of the kernel; ``lead`` bins lie before the arrival.
+        sigma: σ_ls in bins, a scalar.
+        kappa: κ_s per bin, a scalar.
+        n_bins: length K of the kernel.
+        lead: bins before the one that is centred on the arrival.
+
+    Returns:
+        ``[K]`` float32, worked out in double precision; the sum is 1 less what lies outside the kernel.
+
+    Examples:
+        >>> import torch
+        >>> kernel = response(torch.tensor(0.6), torch.tensor(2.0), n_bins=16, lead=4)
+        >>> round(kernel.sum().item(), 6), kernel.argmax().item()
+        (1.0, 4)
+        >>> bins = torch.arange(16) - 4.0
+        >>> round((kernel @ bins).item(), 3)  # the decay delays light by 1/κ on average
+        0.5
     """
     edges = torch.arange(n_bins + 1, dtype=torch.float64, device=sigma.device) - lead - 0.5
     return torch.diff(emg_cdf(edges, sigma.double(), kappa.double())).to(torch.float32)
 
 
 def convolve_time(transients: Tensor, kernel: Tensor, lead: int) -> Tensor:
-    """Causal-with-lead linear convolution of ``[S, T]`` with ``[K]`` along time by zero-padded FFT; result
-    ``[S, T]``.
+    """Linear convolution along time with a kernel that begins ``lead`` bins early, by zero-padded FFT.
+
+    ``out[s, t] = Σ_k kernel[k] transients[s, t - k + lead]``; what leaves the window is lost.
+
+    Args:
+        transients: ``[S, T]``.
+        kernel: ``[K]``.
+        lead: index of the kernel's bin that leaves light where it is.
+
+    Returns:
+        ``[S, T]``.
+
+    Examples:
+        >>> import torch
+        >>> spike = torch.tensor([[0.0, 0.0, 8.0, 0.0, 0.0]])
+        >>> convolve_time(spike, torch.tensor([0.25, 0.5, 0.25]), lead=1).round()
+        tensor([[0., 2., 4., 2., 0.]])
     """
     bins, length = transients.shape[1], kernel.shape[0]
     size = bins + length - 1

@@ -1,4 +1,4 @@
-"""The objective, Eq. 11-14."""
+"""Terms of the objective (paper Eq. 11-14)."""
 
 from __future__ import annotations
 
@@ -7,16 +7,53 @@ from torch import Tensor
 
 
 def transient_loss(measured: Tensor, rendered: Tensor) -> Tensor:
-    """E_H, Eq. 12: mean squared error over all elements of normalised transients ``[S, T]``."""
+    """E_H, paper Eq. 12: mean squared error over all elements, ``Σ(H - H_R)²/(S·T)``.
+
+    Args:
+        measured: ``[S, T]`` transients H, over the counts that count as 1.
+        rendered: ``[S, T]`` transients H_R, over the same.
+
+    Returns:
+        A scalar.
+
+    Examples:
+        >>> import torch
+        >>> transient_loss(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 0.0]]))
+        tensor(2.)
+    """
     return ((measured - rendered) ** 2).mean()
 
 
 def sparsity(intensity: Tensor) -> Tensor:
-    """E_Ipf/λ1, Eq. 13: mean of the maximum projection along z of ``[nz, nx, ny]``."""
+    """E_Ipf/λ1, paper Eq. 13: mean of the maximum projection along z.
+
+    Args:
+        intensity: ``[nz, nx, ny]`` phasor intensity I_pf.
+
+    Returns:
+        A scalar.
+
+    Examples:
+        >>> import torch
+        >>> sparsity(torch.tensor([[[1.0, 0.0]], [[0.5, 0.25]]]))
+        tensor(0.6250)
+    """
     return intensity.amax(0).abs().mean()
 
 
 def albedo_variation(albedo: Tensor) -> Tensor:
-    """E_ρ/λ2, Eq. 14: mean over the voxels of ``[n, nx, ny]`` of ``|∇_xy ρ|₁``, forward differences."""
+    """E_ρ/λ2, paper Eq. 14: mean over the voxels of ``|∇_xy ρ|₁`` by forward differences.
+
+    Args:
+        albedo: ``[n, nx, ny]`` albedo of n depth planes.
+
+    Returns:
+        A scalar.
+
+    Examples:
+        >>> import torch
+        >>> albedo_variation(torch.tensor([[[0.0, 1.0], [0.0, 1.0]]]))  # two steps of 1 among four voxels
+        tensor(0.5000)
+    """
     along_x, along_y = torch.diff(albedo, dim=1).abs(), torch.diff(albedo, dim=2).abs()
     return (along_x.sum() + along_y.sum()) / albedo.numel()

@@ -9,8 +9,8 @@ corner voxel no lower than itself, so it lies in a brick with a maximum no lower
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,7 +20,7 @@ from nlos_lit.functional.concentric import LIPSCHITZ, hemisphere_to_square
 _ROWS = 1 << 17  # samples worked on at once on a CPU
 
 
-class Lattice(NamedTuple):
+class VoxelLattice(NamedTuple):
     """Voxel centres at ``origin + pitch·index``; volumes are ``[nz, nx, ny]``, vectors (x, y, z), metres."""
 
     origin: Tensor  # [3] float32
@@ -37,10 +37,17 @@ class Samples(NamedTuple):
     distance: Tensor  # [M] m from the spot
 
 
-def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """Trilinear corners of ``points`` ``[M, 3]``: flat voxel indices ``[M, 8]`` and weights ``[M, 8]``.
+def corner_weights(points: Tensor, lattice: VoxelLattice) -> tuple[Tensor, Tensor]:
+    """Voxels around points and their trilinear weights.
 
-    Points outside the lattice of voxel centres are clamped to its surface.
+    Args:
+        points: ``[M, 3]`` (x, y, z), m; those outside the lattice of voxel centres are clamped to its
+            surface.
+        lattice: of the volume.
+
+    Returns:
+        Indices ``[M, 8]`` (long) into the flattened volume and weights ``[M, 8]``, which sum to one and are
+        differentiable in ``points``.
     """
     nz, nx, ny = lattice.shape
     size = constants((nx, ny, nz), points)
@@ -56,8 +63,24 @@ def corner_weights(points: Tensor, lattice: Lattice) -> tuple[Tensor, Tensor]:
     return index.reshape(-1, 8), product.reshape(-1, 8)
 
 
-def trilinear(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
-    """``[M]`` values of ``volume`` ``[nz, nx, ny]`` at ``points`` ``[M, 3]`` m; differentiable in both."""
+def trilinear(volume: Tensor, points: Tensor, lattice: VoxelLattice) -> Tensor:
+    """Values of a volume between its voxel centres.
+
+    Args:
+        volume: ``[nz, nx, ny]``.
+        points: ``[M, 3]`` (x, y, z), m; outside the lattice the border's values continue.
+        lattice: of the volume.
+
+    Returns:
+        ``[M]``, differentiable in volume and points.
+
+    Examples:
+        >>> import torch
+        >>> lattice = VoxelLattice(torch.zeros(3), torch.ones(3), (2, 2, 2))
+        >>> volume = torch.tensor([[[0.0, 1.0], [2.0, 3.0]], [[4.0, 5.0], [6.0, 7.0]]])  # 4z + 2x + y
+        >>> trilinear(volume, torch.tensor([[0.5, 0.25, 0.0], [0.0, 0.0, 0.5]]), lattice)
+        tensor([1.2500, 2.0000])
+    """
     return _Trilinear.apply(volume, points, lattice)
 
 
@@ -65,13 +88,13 @@ class _Trilinear(torch.autograd.Function):
     """Keeps the points alone: corners and weights are worked out again, and only where a gradient arrives."""
 
     @staticmethod
-    def forward(ctx, volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
+    def forward(ctx: Any, volume: Tensor, points: Tensor, lattice: VoxelLattice) -> Tensor:
         ctx.lattice = lattice
         ctx.save_for_backward(volume, points)
         return sample(volume, points, lattice)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         volume, points = ctx.saved_tensors
         flat = volume.detach().reshape(-1)
         to_volume = torch.zeros_like(flat) if ctx.needs_input_grad[0] else None
@@ -92,9 +115,17 @@ class _Trilinear(torch.autograd.Function):
 
 
 @torch.no_grad()
-def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
-    """:func:`trilinear` without gradients; of points in single precision by a fused, faster kernel good to
-    1e-5 voxels.
+def sample(volume: Tensor, points: Tensor, lattice: VoxelLattice) -> Tensor:
+    """:func:`trilinear` without gradients.
+
+    Args:
+        volume: ``[nz, nx, ny]``.
+        points: ``[M, 3]`` (x, y, z), m; in single precision they go to a fused, faster kernel good to 1e-5
+            voxels.
+        lattice: of the volume.
+
+    Returns:
+        ``[M]``.
     """
     if points.dtype == torch.float64:
         parts, flat = points.split(_ROWS) if points.device.type == "cpu" else (points,), volume.reshape(-1)
@@ -105,23 +136,38 @@ def sample(volume: Tensor, points: Tensor, lattice: Lattice) -> Tensor:
     return sample_unit(volume, ((points - lattice.origin) * scale + shift)[:, [1, 0, 2]])
 
 
-def unit_scale(lattice: Lattice) -> tuple[Tensor, Tensor]:
-    """Factor and summand that bring (x, y, z) relative to the lattice's origin into [-1, 1]."""
+def unit_scale(lattice: VoxelLattice) -> tuple[Tensor, Tensor]:
+    """Factor and summand ``[3]`` that bring (x, y, z) relative to the lattice's origin into [-1, 1]."""
     sizes = (lattice.shape[1], lattice.shape[2], lattice.shape[0])
     cells = constants([max(n - 1, 1) for n in sizes], lattice.pitch)
     return 2 / (lattice.pitch * cells), constants([-1.0 if n > 1 else 0.0 for n in sizes], lattice.pitch)
 
 
 def constants(values: Sequence[float], like: Tensor) -> Tensor:
-    """Numbers as a tensor, written by the device itself: a copy from the host would wait for it."""
+    """Numbers as a tensor, written by the device itself: a copy from the host would wait for it.
+
+    Args:
+        values: N numbers.
+        like: tensor that gives type and device.
+
+    Returns:
+        ``[N]``.
+    """
     return torch.stack([torch.full((), value, dtype=like.dtype, device=like.device) for value in values])
 
 
 def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
-    """Values of ``volume`` ``[nz, nx, ny]`` at ``[M, 3]`` (y, x, z) in [-1, 1]; beyond, those of the border.
+    """Values of a volume at places in units of its half sides.
 
     The kernel is parallel over its batch only, so the points are dealt into as many batches as keep all
     threads busy.
+
+    Args:
+        volume: ``[nz, nx, ny]``.
+        unit: ``[M, 3]`` places (y, x, z) in [-1, 1]; beyond, the border's values continue.
+
+    Returns:
+        ``[M]``.
     """
     batches = 4 * torch.get_num_threads() if volume.device.type == "cpu" else 1
     count = len(unit)
@@ -136,16 +182,38 @@ def sample_unit(volume: Tensor, unit: Tensor) -> Tensor:
 
 
 def occupied_bricks(volume: Tensor, threshold: float, size: tuple[int, int, int]) -> Tensor:
-    """``[B, 3]`` (z, x, y) indices of bricks of ``size`` cells in which some corner voxel reaches
-    ``threshold``.
+    """Bricks of cells in which some corner voxel reaches a threshold.
 
     A cell lies between neighbouring voxel centres; brick ``b`` holds cells ``b·size … (b+1)·size - 1``.
+
+    Args:
+        volume: ``[nz, nx, ny]``.
+        threshold: least value.
+        size: cells of a brick along (z, x, y).
+
+    Returns:
+        ``[B, 3]`` indices (z, x, y) of the bricks.
+
+    Examples:
+        >>> import torch
+        >>> volume = torch.zeros(5, 5, 5)
+        >>> volume[4, 0, 3] = 1.0
+        >>> occupied_bricks(volume, 0.5, (2, 2, 2))
+        tensor([[1, 0, 1]])
     """
     return torch.nonzero(brick_maximum(volume, size)[0, 0] >= threshold)
 
 
 def brick_maximum(volume: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """``[1, 1, bz, bx, by]`` largest corner voxel of each brick of :func:`occupied_bricks`."""
+    """Largest corner voxel of each brick of :func:`occupied_bricks`.
+
+    Args:
+        volume: ``[nz, nx, ny]``.
+        size: cells of a brick along (z, x, y).
+
+    Returns:
+        ``[1, 1, bz, bx, by]``.
+    """
     nz, nx, ny = volume.shape
     cells = [max(n - 1, 1) for n in (nz, nx, ny)]
     bricks = [-(-n // s) for n, s in zip(cells, size, strict=True)]
@@ -158,7 +226,7 @@ def brick_maximum(volume: Tensor, size: tuple[int, int, int]) -> Tensor:
 @torch.no_grad()
 def march(
     volume: Tensor,
-    lattice: Lattice,
+    lattice: VoxelLattice,
     origins: Tensor,
     frames: Tensor,
     rays: Tensor,
@@ -176,13 +244,30 @@ def march(
 
     Args:
         volume: ``[nz, nx, ny]`` intensity, scaled to a unit maximum.
-        origins: ``[S, 3]`` wall points; frames: ``[S, 3, 3]`` local-to-world rotations.
+        lattice: of the volume.
+        origins: ``[S, 3]`` wall points, m.
+        frames: ``[S, 3, 3]`` local-to-world rotations, from
+            :func:`~nlos_lit.functional.concentric.wall_frame`.
         rays: ``[n·n, 3]`` local directions from :func:`~nlos_lit.functional.concentric.ray_grid`.
         threshold: a ray whose largest sample is below it meets no surface.
         step: samples lie at ``(k + ½)·step`` from the wall point, m.
         reach: samples lower than the maximum by more than this carry no weight in the softargmax.
         fine: samples a step around the maximum.
         chunk: samples evaluated at once, bounds the memory.
+
+    Returns:
+        K hits, in the order of spots and rays, with M samples.
+
+    Examples:
+        A bright plane of voxels 1 m in front of one spot, seen along the wall's normal:
+
+        >>> import torch
+        >>> lattice = VoxelLattice(torch.tensor([-0.5, -0.5, 0.5]), torch.full((3,), 0.25), (5, 5, 5))
+        >>> volume = torch.zeros(5, 5, 5)
+        >>> volume[2] = 1.0
+        >>> ahead, spot = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3)
+        >>> march(volume, lattice, spot, torch.eye(3)[None], ahead, threshold=0.5, step=0.1, reach=0.05)
+        Samples(spot=tensor([0]), ray=tensor([0]), hit=tensor([0, 0]), distance=tensor([0.9500, 1.0500]))
     """
     n, device = round(rays.shape[0] ** 0.5), volume.device
     # Bricks about as deep as wide, four lateral cells across: small enough to skip, large enough to be few.
@@ -265,13 +350,21 @@ def march(
 
 
 def expand(counts: Tensor) -> tuple[Tensor, Tensor]:
-    """For counts ``[P]``: owner index and running index ``[ΣP]`` of every element."""
+    """Owner index and running index, ``[Σ counts]`` each, of ``counts`` ``[P]`` elements in a row.
+
+    Examples:
+        >>> import torch
+        >>> expand(torch.tensor([2, 0, 1]))
+        (tensor([0, 0, 2]), tensor([0, 1, 0]))
+    """
     owner = torch.repeat_interleave(torch.arange(len(counts), device=counts.device), counts)
     start = torch.cumsum(counts, 0) - counts
     return owner, torch.arange(len(owner), device=counts.device) - start[owner]
 
 
-def _candidates(cells, extent, origin, origins, frames, n, chunk):
+def _candidates(
+    cells: Tensor, extent: Tensor, origin: Tensor, origins: Tensor, frames: Tensor, n: int, chunk: int
+) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield pairs spot·bricks + brick with rays spot·n² + ray that contain every ray through every brick.
 
     A brick lies in a cone of half-angle α about its centre; the concentric map stretches by at most
@@ -308,9 +401,7 @@ def _candidates(cells, extent, origin, origins, frames, n, chunk):
 
 
 def _clip(box: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit distance of rays with ``inverse`` directions through boxes given by opposite corners;
-    entry ≥ exit: a miss.
-    """
+    """Entry and exit distance of rays through boxes given by opposite corners; entry ≥ exit: a miss."""
     one, two = box[:, :3] * inverse, box[:, 3:] * inverse
     return torch.minimum(one, two).amax(1), torch.maximum(one, two).amin(1)
 

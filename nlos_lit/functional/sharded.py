@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -32,6 +33,13 @@ class Slabs:
     def join(cls, planes: int, ranks: int) -> Slabs:
         """This process's place among those that run; called by all of them.
 
+        Args:
+            planes: depth planes of the whole volume.
+            ranks: processes that the plan of the field counts on.
+
+        Returns:
+            The slabs, with a process group of their own.
+
         Raises:
             UserError: not ``ranks`` processes are running.
         """
@@ -43,11 +51,17 @@ class Slabs:
         return cls(planes, ranks, dist.get_rank(), dist.new_group())
 
     def slab(self, rank: int) -> slice:
-        """Planes of a process."""
+        """Planes of process ``rank``.
+
+        Examples:
+            >>> [Slabs(planes=7, ranks=3, rank=0).slab(rank) for rank in range(3)]
+            [slice(0, 2, None), slice(2, 4, None), slice(4, 7, None)]
+        """
         return slice(rank * self.planes // self.ranks, (rank + 1) * self.planes // self.ranks)
 
     @property
     def own(self) -> slice:
+        """Planes of this process."""
         return self.slab(self.rank)
 
     @property
@@ -56,8 +70,10 @@ class Slabs:
         return most_planes(self.planes, self.ranks)
 
     def handed_over(self, plane: int) -> int:
-        """Bytes each process hands over in an iteration, with ``plane`` voxels a plane: its slab, and its
-        gradient of all slabs.
+        """Bytes each process hands over in an iteration: its slab, and its gradient of all slabs.
+
+        Args:
+            plane: voxels of a depth plane.
         """
         return 4 * plane * self.most * (1 + self.ranks)
 
@@ -65,13 +81,25 @@ class Slabs:
 def most_planes(planes: int, ranks: int) -> int:
     """Planes of the largest slab.
 
+    Args:
+        planes: of the whole volume.
+        ranks: processes that share them.
+
+    Returns:
+        ``planes/ranks``, rounded up.
+
     Raises:
         UserError: there are more processes than planes.
+
+    Examples:
+        >>> most_planes(7, 3)
+        3
     """
     if ranks > planes:
         raise UserError(
-            f"shard_field=true gives each of {ranks} processes a slab of depth planes, the volume has {planes}; use fewer "
-            "processes (trainer.devices), more planes (scene.volume.depth_pitch) or shard_field=false"
+            f"shard_field=true gives each of {ranks} processes a slab of depth planes, the volume has "
+            f"{planes}; use fewer processes (trainer.devices), more planes (scene.volume.depth_pitch) or "
+            "shard_field=false"
         )
     return -(-planes // ranks)
 
@@ -85,7 +113,8 @@ class GatherPlanes(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, own: Tensor, slabs: Slabs) -> Tensor:
+    def forward(ctx: Any, own: Tensor, slabs: Slabs) -> Tensor:
+        """``[planes, …]`` from this process's slab ``[own planes, …]`` and those of the others."""
         ctx.slabs = slabs
         found = own.new_empty(slabs.ranks, slabs.most, *own.shape[1:])
         dist.all_gather(list(found), _filled(own, slabs.most), group=slabs.group)
@@ -94,7 +123,8 @@ class GatherPlanes(torch.autograd.Function):
         return torch.cat([found[rank, : _length(slabs.slab(rank))] for rank in range(slabs.ranks)])
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        """The slab's gradient, summed over processes."""
         slabs = ctx.slabs
         parts = [_filled(grad[slabs.slab(rank)].contiguous(), slabs.most) for rank in range(slabs.ranks)]
         own = torch.empty_like(parts[0])
@@ -103,10 +133,9 @@ class GatherPlanes(torch.autograd.Function):
 
 
 def leave_buffers(module: nn.Module) -> None:
-    """Keep DistributedDataParallel from copying all buffers, the phasor field too, from the first process in
-    every iteration.
+    """Keep DistributedDataParallel from copying all buffers from the first process in every iteration.
 
-    They never change once they are made, and a slab is its process's own.
+    The phasor field is one of them. They never change once they are made, and a slab is its process's own.
     """
     DistributedDataParallel._set_params_and_buffers_to_ignore_for_model(
         module, [name for name, _ in module.named_buffers()]

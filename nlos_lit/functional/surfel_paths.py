@@ -10,7 +10,7 @@ A the surfel's true area. A cell is integrated with n × n points, so that arriv
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -34,7 +34,19 @@ class Paths(NamedTuple):
 
 
 def quadrature(n: int, device: torch.device | str = "cpu") -> Tensor:
-    """``[n², 2]`` midpoints of n × n parts of a unit cell centred on 0."""
+    """Midpoints of n × n parts of a unit cell centred on 0.
+
+    Args:
+        n: parts along a side.
+        device: where the result lies.
+
+    Returns:
+        ``[n², 2]`` in cells.
+
+    Examples:
+        >>> quadrature(2).tolist()
+        [[-0.25, -0.25], [-0.25, 0.25], [0.25, -0.25], [0.25, 0.25]]
+    """
     line = (torch.arange(n, dtype=torch.float32, device=device) + 0.5) / n - 0.5
     return torch.cartesian_prod(line, line).reshape(-1, 2)
 
@@ -47,10 +59,21 @@ def spread(normal: Tensor, cell: Tensor, offsets: Tensor) -> tuple[Tensor, Tenso
     vertical.
 
     Args:
-        normal: ``[M, 3]`` unit, towards the wall's side. cell: ``[2]`` m. offsets: ``[Q, 2]``.
+        normal: ``[M, 3]`` unit, towards the wall's side.
+        cell: ``[2]`` lateral extents, m.
+        offsets: ``[Q, 2]`` from :func:`quadrature`.
 
     Returns:
-        ``[M, Q, 3]`` m and ``[M]`` m².
+        ``[M, Q, 3]`` points, m, and ``[M]`` areas, m².
+
+    Examples:
+        A patch tilted by 60° covers its cell with twice the area:
+
+        >>> import torch
+        >>> tilted = torch.tensor([[0.75**0.5, 0.0, -0.5]])
+        >>> points, area = spread(tilted, torch.tensor([0.1, 0.1]), quadrature(2))
+        >>> points.shape, round(area.item(), 6)
+        (torch.Size([1, 4, 3]), 0.02)
     """
     across, upright = normal[:, :2], -normal[:, 2]
     stretch = 1 / upright.clamp_min(STEEP)
@@ -73,12 +96,31 @@ def trace(
     sensor_normal: Tensor,
     confocal: bool,
 ) -> Paths:
-    """All paths of a batch of spots.
+    """All third-bounce paths of a batch of spots, laser → surfel → sensor (paper Eq. 6-7).
 
     Args:
-        centre: ``[M, 3]`` m. normal: ``[M, 3]`` unit. cell: ``[2]`` lateral extents, m.
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit, towards the wall's side.
+        cell: ``[2]`` lateral extents, m.
         offsets: ``[Q, 2]`` from :func:`quadrature`.
-        laser, sensor, laser_normal, sensor_normal: ``[B, 3]``; only the laser's are used when ``confocal``.
+        laser: ``[B, 3]`` illuminated wall points, m.
+        laser_normal: ``[B, 3]`` unit normals there.
+        sensor: ``[B, 3]`` observed wall points, m; not used when ``confocal``.
+        sensor_normal: ``[B, 3]`` unit normals there; not used when ``confocal``.
+        confocal: whether the sensor looks at the laser's points.
+
+    Returns:
+        Paths of B spots over M surfels with Q points each.
+
+    Examples:
+        A surfel of 1 cm² straight ahead at 1 m, both facing each other: throughput A/d⁴.
+
+        >>> import torch
+        >>> spot, up = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
+        >>> cell = torch.tensor([0.01, 0.01])
+        >>> paths = trace(up, -up, cell, quadrature(1), spot, up, spot, up, confocal=True)
+        >>> round(paths.contribution.item(), 8), paths.length.item()
+        (0.0001, 2.0)
     """
     shift, area = spread(normal, cell, offsets)
     points = (centre[:, None] + shift).unbind(2)
@@ -111,14 +153,23 @@ def _leg(
 
 
 def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
-    """Cubic B-spline shares of an arrival at ``time`` (bins; bin k is centred on k + ½).
+    """Cubic B-spline shares of arrivals in the four nearest time bins.
 
     They sum to one and have the right mean and variance ``SPLINE_VARIANCE`` at every sub-bin phase, so that
     shifting a path by part of a bin neither makes nor loses light (de Boor, *A Practical Guide to Splines*,
     ch. IX).
 
+    Args:
+        time: ``[…]`` in bins; bin k is centred on k + ½.
+
     Returns:
-        first bin (long) of the shape of ``time``; weights ``[…, 4]`` of it and the three bins after.
+        First bin, ``[…]`` long, and weights ``[…, 4]`` of it and the three bins after.
+
+    Examples:
+        >>> import torch
+        >>> first, weights = spline_weights(torch.tensor(5.5))
+        >>> first, 6 * weights
+        (tensor(4), tensor([1., 4., 1., 0.]))
     """
     first = torch.floor(time.detach() - 0.5)
     f = time - 0.5 - first
@@ -130,22 +181,29 @@ def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def spline_slopes(time: Tensor) -> Tensor:
-    """Derivatives ``[…, 4]`` of :func:`spline_weights` by time, 1/bin."""
+    """Derivatives of the weights of :func:`spline_weights` by time.
+
+    Args:
+        time: ``[…]`` in bins.
+
+    Returns:
+        ``[…, 4]``, 1/bin; they sum to zero.
+    """
     f = time - 0.5 - torch.floor(time.detach() - 0.5)
     g = 1 - f
     return torch.stack([-(g**2) / 2, (3 * f**2 - 4 * f) / 2, (4 * g - 3 * g**2) / 2, f**2 / 2], dim=-1)
 
 
 class SplineSplat(torch.autograd.Function):
-    """``[B, T]`` transients from contributions ``[B, K]`` at times ``[B, K]`` (bins); what leaves [0, T) is
-    lost.
+    """Transients ``[B, T]`` from contributions ``[B, K]`` at times ``[B, K]`` (bins) by cubic B-splines.
 
-    Written out because autograd through the composed operations takes three times as long and ten times the
-    memory.
+    What leaves [0, T) is lost. Written out because autograd through the composed operations takes three times
+    as long and ten times the memory.
     """
 
     @staticmethod
     def forward(contribution: Tensor, time: Tensor, n_bins: int) -> Tensor:
+        """``[B, n_bins]`` in the unit of ``contribution``."""
         row = torch.arange(len(time), device=time.device)[:, None] * (n_bins + 8)
         time = time.clamp(-2.0, n_bins + 2.0)
         first, weights = spline_weights(time)
@@ -156,20 +214,23 @@ class SplineSplat(torch.autograd.Function):
         return flat.view(len(time), n_bins + 8)[:, 4 : 4 + n_bins].contiguous()
 
     @staticmethod
-    def setup_context(ctx, inputs, output) -> None:
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
+        """Keep contributions and times for both directions of differentiation."""
         contribution, time, ctx.n_bins = inputs
         ctx.save_for_backward(contribution, time)
         ctx.save_for_forward(contribution, time)
 
     @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        """Gradients ``[B, K]`` of contributions and times from ``[B, T]`` of the transients."""
         contribution, time = ctx.saved_tensors
         gathered = gather_bins(grad, time)
         _, weights = spline_weights(time)
         return (gathered * weights).sum(-1), contribution * (gathered * spline_slopes(time)).sum(-1), None
 
     @staticmethod
-    def jvp(ctx, d_contribution: Tensor | None, d_time: Tensor | None, _) -> Tensor:
+    def jvp(ctx: Any, d_contribution: Tensor | None, d_time: Tensor | None, _: None) -> Tensor:
+        """Change ``[B, T]`` of the transients with those of contributions and times."""
         contribution, time = ctx.saved_tensors
         first, weights = spline_weights(time)
         values = torch.zeros_like(weights)
@@ -181,8 +242,20 @@ class SplineSplat(torch.autograd.Function):
 
 
 def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
-    """``[B, n_bins]``: ``values`` ``[B, …, 4]`` added to the bins ``first … first + 3``; what lies outside is
-    lost.
+    """Values added to the four bins from ``first`` on; what lies outside the record is lost.
+
+    Args:
+        values: ``[B, …, 4]``.
+        first: ``[B, …]`` long, first bins as of :func:`spline_weights`.
+        n_bins: bins T of the record.
+
+    Returns:
+        ``[B, T]``.
+
+    Examples:
+        >>> import torch
+        >>> scatter_bins(torch.tensor([[[1.0, 4.0, 1.0, 0.0]]]), torch.tensor([[-1]]), n_bins=3)
+        tensor([[4., 1., 0.]])
     """
     bins = first.reshape(len(first), -1)[..., None] + torch.arange(4, device=first.device)
     values = values.reshape(bins.shape)
@@ -194,8 +267,19 @@ def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
 
 
 def gather_bins(image: Tensor, time: Tensor) -> Tensor:
-    """``[B, K, 4]`` values of ``image`` ``[B, T]`` in the four bins that an arrival at ``time`` ``[B, K]``
-    fills; 0 outside.
+    """Values of transients in the four bins that arrivals fill: the transpose of splatting.
+
+    Args:
+        image: ``[B, T]``.
+        time: ``[B, K]`` in bins.
+
+    Returns:
+        ``[B, K, 4]``, 0 outside the record.
+
+    Examples:
+        >>> import torch
+        >>> gather_bins(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[1.5]]))
+        tensor([[[1., 2., 3., 0.]]])
     """
     n_bins = image.shape[1]
     padded = torch.nn.functional.pad(image, (4, 4)).reshape(-1)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.functional.concentric import ray_grid, wall_frame
 from nlos_lit.functional.fixed_size_march import Capacity, StaticSamples, static_march
-from nlos_lit.functional.march import Lattice, Samples, march, trilinear
+from nlos_lit.functional.march import VoxelLattice, Samples, march, trilinear
 
 
 class Surface(NamedTuple):
@@ -71,8 +71,8 @@ class ImplicitGeometry(nn.Module):
         self.register_buffer("pitch", torch.tensor(grid.pitch, dtype=torch.float32), persistent=False)
 
     @property
-    def lattice(self) -> Lattice:
-        return Lattice(self.origin, self.pitch, self.shape)
+    def lattice(self) -> VoxelLattice:
+        return VoxelLattice(self.origin, self.pitch, self.shape)
 
     def forward(self, intensity: Tensor, origins: Tensor, normals: Tensor) -> Surface:
         """Args: intensity ``[nz, nx, ny]``, unit maximum; origins, normals ``[S, 3]`` of the wall points."""

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 from nlos_lit.functional.concentric import ray_grid, wall_frame
-from nlos_lit.functional.march import Lattice, expand, march, occupied_bricks, trilinear
+from nlos_lit.functional.march import VoxelLattice, expand, march, occupied_bricks, trilinear
 
 REACH = 0.15
 
 
-def lattice(origin, pitch, shape) -> Lattice:
-    return Lattice(torch.tensor(origin), torch.tensor(pitch), shape)
+def lattice(origin, pitch, shape) -> VoxelLattice:
+    return VoxelLattice(torch.tensor(origin), torch.tensor(pitch), shape)
 
 
-def dense(volume, grid: Lattice, origins, frames, rays, threshold, step, reach, far=None):
+def dense(volume, grid: VoxelLattice, origins, frames, rays, threshold, step, reach, far=None):
     """Every sample of every ray out to where nothing can be left; (ray line, sample number) of those near the
     ray's maximum.
     """
@@ -213,7 +213,7 @@ def test_trilinear_by_hand():
 
 
 def test_trilinear_gradients():
-    grid = Lattice(
+    grid = VoxelLattice(
         torch.zeros(3, dtype=torch.float64), torch.tensor([0.3, 0.2, 0.5], dtype=torch.float64), (3, 4, 3)
     )
     generator = torch.manual_seed(6)
