@@ -1,1 +1,1 @@
-"""The paper's simulated measurement: phasor image, implicit surface, transient renderer, laser-sensor model."""
+"""The paper's simulated measurement: phasor image, implicit surface, transient renderer, laser and sensor."""

@@ -1,4 +1,4 @@
-"""Laser-sensor model (Eq. 10 and supplement Sec. 1): H_R = Ψ(I_l, κ_s, σ_ls) * H_r + η_s."""
+"""Laser-sensor model (paper Eq. 10 and supplement Sec. 1): H_R = Ψ(I_l, κ_s, σ_ls) * H_r + η_s."""
 
 from __future__ import annotations
 
@@ -13,16 +13,36 @@ from nlos_lit.model.parameters import BoundedParameter
 
 
 class LaserSensor(nn.Module):
-    """Four parameters turn rendered transients into expected photon counts.
+    """Four parameters turn rendered transients into expected photon counts (paper Eq. 10).
+
+    ``H_R = I_l · (N(0, σ_ls) * κ_s e^{-κ_s t}) * H_r + η_s``, integrated over time bins.
 
     Args:
-        bin_length: m.
+        bin_length: path length of a bin, m.
         n_bins: bins of the transients; the kernel reaches that far behind the arrival at most.
-        sigma_ls: joint laser and jitter width, m of path. kappa_s: decay rate, 1/m of path.
-        intensity: I_l, counts per unit of H_r. background: η_s, counts per bin.
+        sigma_ls: σ_ls, joint width of laser pulse and jitter, m of path.
+        kappa_s: κ_s, decay rate, 1/m of path.
+        intensity: I_l, counts per unit of H_r.
+        background: η_s, counts per bin.
         splat_sigma: width of the renderer's splat in bins. When given, its variance is taken out of Ψ, so
             that σ_ls is the physical width; then σ_ls cannot be smaller than the splat. None applies Ψ on top
             of the splat, as the paper does.
+
+    Examples:
+        >>> import torch
+        >>> sensor = LaserSensor(
+        ...     bin_length=0.01,
+        ...     n_bins=100,
+        ...     sigma_ls=BoundedParameter(0.01, 0.005, 0.1, "m"),
+        ...     kappa_s=BoundedParameter(200.0, 50.0, 1000.0, "1/m"),
+        ...     intensity=BoundedParameter(1000.0, 1.0, 1e6, "counts m2"),
+        ...     background=BoundedParameter(0.5, 0.01, 10.0, "counts/bin"),
+        ... )
+        >>> rendered = torch.zeros(1, 100)
+        >>> rendered[0, 40] = 0.02
+        >>> expected = sensor(rendered)  # 20 counts of signal and 0.5 a bin
+        >>> round(expected.sum().item(), 2), expected.argmax().item()
+        (70.0, 40)
     """
 
     def __init__(
@@ -50,7 +70,7 @@ class LaserSensor(nn.Module):
         self.length = self.lead + min(n_bins, 2 + math.ceil(tail))
 
     def kernel(self) -> Tensor:
-        """Ψ/I_l ``[length]``: share of a path's energy per bin, bin ``lead`` centred on its arrival."""
+        """Share Ψ/I_l ``[length]`` of a path's energy per bin, bin ``lead`` centred on its arrival."""
         sigma = self.sigma_ls() / self.bin_length
         width = torch.sqrt((sigma**2 - self.splat_variance).clamp_min(1e-6))
         return response(width, self.kappa_s() * self.bin_length, self.length, self.lead)
@@ -61,5 +81,9 @@ class LaserSensor(nn.Module):
 
     @staticmethod
     def smallest_sigma(splat_sigma: float) -> float:
-        """Smallest σ_ls in bins that leaves Ψ a width of a twentieth of a bin once the splat is taken out."""
+        """Smallest σ_ls in bins that leaves Ψ a width of a twentieth of a bin without the splat.
+
+        Args:
+            splat_sigma: σ_t of the splat, in bins.
+        """
         return math.sqrt(splat_variance(splat_sigma) + 0.05**2)

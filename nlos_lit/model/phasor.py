@@ -1,6 +1,4 @@
-"""Phasor imaging (Sec. 3.1, 4.1): transients → volumetric intensity I_pf, differentiable in Θ_pf = {Ω_pf,
-σ_pf}.
-"""
+"""Phasor imaging (paper Sec. 3.1, 4.1): transients → intensity I_pf, differentiable in {Ω_pf, σ_pf}."""
 
 from __future__ import annotations
 
@@ -55,9 +53,10 @@ class PhasorPlan:
 
     def __str__(self) -> str:
         kind = str(self.precision).removeprefix("torch.") + (" on disk" if self.on_disk else "")
+        way = "FFT convolution" if self.method == "lattice" else "direct sum"
         return (
-            f"phasor basis by {'FFT convolution' if self.method == 'lattice' else 'direct sum'}: {self.n_frequencies} frequencies "
-            f"in {self.rank} dimensions, {self.field_bytes / 2**30:.2f} GiB {kind} + {self.working_bytes / 2**30:.2f} GiB working"
+            f"phasor basis by {way}: {self.n_frequencies} frequencies in {self.rank} dimensions, "
+            f"{self.field_bytes / 2**30:.2f} GiB {kind} + {self.working_bytes / 2**30:.2f} GiB working"
             + (f" in each of {self.shards} processes" if self.shards > 1 else "")
         )
 
@@ -72,8 +71,16 @@ class LatticeLayout:
     padded_points: int  # of the zero-padded transform
 
     def plane_bytes(self, n_freq: int, rank: int) -> int:
-        """Working memory of one plane: kernel spectra of all frequencies when confocal, else what is summed
-        over them.
+        """Working memory of one plane.
+
+        Confocal scans keep the kernel's spectra of all frequencies, the others what is summed over them.
+
+        Args:
+            n_freq: F, frequencies.
+            rank: R, dimensions of the basis.
+
+        Returns:
+            Bytes.
         """
         quarter = self.padded_points // 4 if self.geometry.fixed is None else 0
         return 8 * n_freq * quarter + 8 * rank * self.padded_points * 3
@@ -89,9 +96,14 @@ class PhasorImaging(nn.Module):
         power: p; the paper's Eq. 2 has 2, its code 1.
         depth_exponent: q; compensates the falloff with depth. The paper has 0, its code 2.
         tolerance: relative error of the virtual spectrum in the stored basis.
+
+    Call :meth:`plan`, then :meth:`prepare`; then the module is a function of Θ_pf alone.
     """
 
     field: Tensor
+    basis: Tensor
+    omega: Tensor
+    gain: Tensor
 
     def __init__(
         self,
@@ -116,14 +128,20 @@ class PhasorImaging(nn.Module):
         self.register_buffer("gain", gain[:, None, None], persistent=False)
 
     def plan(self, capture: Capture, memory_budget: int, shards: int = 1) -> PhasorPlan:
-        """Frequencies, rank, precision, place and bytes for this capture: single precision in memory, half,
-        or single on disk.
+        """Work out frequencies, rank, precision, place and bytes for a capture; allocates no field.
+
+        The field is single precision in memory where that fits, else half precision, else single on disk.
 
         Args:
+            capture: what will be imaged.
             memory_budget: bytes, of one process.
             shards: processes that share the depth planes.
 
+        Returns:
+            The plan, for :meth:`prepare`.
+
         Raises:
+            CaptureError: the volume lies outside the gate.
             MemoryBudgetError: not even what propagates the field fits ``memory_budget`` bytes, or the disk is
                 too small.
             UserError: more ``shards`` than depth planes.
@@ -135,9 +153,8 @@ class PhasorImaging(nn.Module):
         n_freq, rank = self.basis.shape
         layout = self._layout(capture)
         first, last = self._window(capture)
-        reading = capture.n_spots * (
-            8 * (last - first) + 16 * n_freq
-        )  # counts twice, the spectrum and its two halves
+        # Counts twice, the spectrum and its two halves.
+        reading = capture.n_spots * (8 * (last - first) + 16 * n_freq)
         if layout is None:
             propagating = capture.n_spots * (8 * n_freq + 256 * 96)
         else:
@@ -165,10 +182,11 @@ class PhasorImaging(nn.Module):
             ):
                 return plan
         raise MemoryBudgetError(
-            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB of memory and "
-            f"{plan.field_bytes / 2**30:.1f} GiB of temporary disk even when it is streamed, the budget is "
-            f"{memory_budget / 2**30:.1f} GiB (disk: {_free_disk() / 2**30:.1f} GiB); sum time bins or spots (scene.sum_bins, "
-            "scene.sum_spots), shorten scene.volume.depth, widen scene.volume.depth_pitch, or raise memory_budget"
+            f"the phasor basis of {self.grid.shape} voxels × {rank} needs {plan.total_bytes / 2**30:.1f} GiB "
+            f"of memory and {plan.field_bytes / 2**30:.1f} GiB of temporary disk even when it is streamed, "
+            f"the budget is {memory_budget / 2**30:.1f} GiB (disk: {_free_disk() / 2**30:.1f} GiB); sum time "
+            "bins or spots (scene.sum_bins, scene.sum_spots), shorten scene.volume.depth, widen "
+            "scene.volume.depth_pitch, or raise memory_budget"
         )
 
     @torch.no_grad()
@@ -180,13 +198,18 @@ class PhasorImaging(nn.Module):
         spots: np.ndarray | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Propagate the gated transients of ``spots`` (all when None) once; fills ``field`` ``[V, 2, R]`` (or
-        its file).
+        """Propagate the gated transients once; fills ``field`` ``[V, 2, R]`` or its file.
 
         Of a plan for several processes each calls this and propagates the voxels of its own planes.
 
         Args:
+            capture: what was measured.
+            plan: from :meth:`plan` of the same capture.
+            spots: rows of the capture that are imaged, the others count as dark; None takes all.
             progress: called with (planes or blocks done, of how many).
+
+        Raises:
+            UserError: the plan is for another number of processes than are running.
         """
         nearest = path_range(capture, self.grid)[0] / 2
         spectrum = self._spectrum(capture, spots)
@@ -217,9 +240,7 @@ class PhasorImaging(nn.Module):
         self.field = field
 
     def forward(self) -> Tensor:
-        """``[nz, nx, ny]`` intensity with a unit maximum; all processes that share the field call it
-        together.
-        """
+        """Intensity ``[nz, nx, ny]`` with a unit maximum; processes that share the field call it together."""
         if self.image is not None and not torch.is_grad_enabled():
             return self.image
         weights = F.virtual_illumination(self.omega, self.omega_pf(), self.sigma_pf())
@@ -236,7 +257,7 @@ class PhasorImaging(nn.Module):
 
     @torch.no_grad()
     def hold(self) -> None:
-        """Keep the volume as it is now for all that asks for it without gradients until :meth:`release`.
+        """Keep the volume as it is, for all that ask for it without gradients, until :meth:`release`.
 
         All processes that share the field call this together; after that each may look at the volume as often
         as it likes.
@@ -272,9 +293,7 @@ class PhasorImaging(nn.Module):
         return F.spectrum(counts, time, self.omega)
 
     def _layout(self, capture: Capture) -> LatticeLayout | None:
-        """How the voxels lie on the scan's lattice; None where they or the spots do not, and the direct sum
-        is needed.
-        """
+        """How the voxels lie on the scan's lattice; None where the direct sum is needed."""
         geometry = scan_geometry(capture)
         if geometry is None:
             return None
@@ -303,9 +322,9 @@ class PhasorImaging(nn.Module):
             sparse[:, :, ::refine, ::refine] = field
             field = sparse
         plane = geometry.lattice.origin[2]
-        fixed = geometry.fixed
-        if fixed is not None:
-            fixed = torch.from_numpy(fixed - np.array([0.0, 0.0, plane])).to(field.device)
+        fixed = None
+        if geometry.fixed is not None:
+            fixed = torch.from_numpy(geometry.fixed - np.array([0.0, 0.0, plane])).to(field.device)
         return F.lattice_phasors(
             field,
             self.omega,

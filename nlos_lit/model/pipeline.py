@@ -18,19 +18,32 @@ from nlos_lit.model.renderer import TransientRenderer
 
 
 class Rendering(NamedTuple):
-    """Everything one forward pass finds for a batch of S spots."""
+    """Everything one forward pass finds for a batch of S spots and K surface points."""
 
     expected: Tensor  # [S, T_gate] H_R, counts
     intensity: Tensor  # [nz, nx, ny] I_pf
     albedo: Tensor  # [nz, nx, ny] ρ
     surface: Surface
-    surface_albedo: Tensor  # [K]
+    surface_albedo: Tensor  # [K] ρ at the surface points
 
 
 class Pipeline(nn.Module):
-    """Phasor imaging, implicit geometry, transient rendering and laser-sensor response over one capture's
-    wall points.
+    """Phasor imaging, implicit geometry, transient rendering and laser-sensor response of one capture.
+
+    Args:
+        capture: gives the wall points, their normals and the gate; its counts are not kept.
+        phasor: H → I_pf; :meth:`~nlos_lit.model.phasor.PhasorImaging.prepare` must have been called before
+            the first forward pass.
+        geometry: I_pf → G.
+        albedo: I_pf → ρ per voxel.
+        renderer: G, ρ → H_r.
+        laser_sensor: H_r → H_R.
     """
+
+    laser: Tensor
+    sensor: Tensor
+    laser_normal: Tensor
+    sensor_normal: Tensor
 
     def __init__(
         self,
@@ -53,7 +66,14 @@ class Pipeline(nn.Module):
             )
 
     def forward(self, spots: Tensor) -> Rendering:
-        """Args: spots ``[S]`` rows of the capture."""
+        """Simulate the measurement of some spots.
+
+        Args:
+            spots: ``[S]`` long, rows of the capture.
+
+        Returns:
+            Expected counts inside the gate, and what led to them.
+        """
         intensity = self.phasor()
         albedo = self.albedo(intensity)
         rendered, surface, surface_albedo = self.render(intensity, albedo, spots)
@@ -62,8 +82,15 @@ class Pipeline(nn.Module):
         )
 
     def surface(self, intensity: Tensor, sensor: Tensor, normal: Tensor) -> Surface:
-        """The surface seen from each of ``sensor`` ``[S, 3]``; points that occur several times are marched
-        from once.
+        """The surface seen from wall points; those that occur several times are marched from once.
+
+        Args:
+            intensity: ``[nz, nx, ny]`` I_pf, unit maximum.
+            sensor: ``[S, 3]`` wall points, m.
+            normal: ``[S, 3]`` unit wall normals.
+
+        Returns:
+            The surface, with ``spot`` an index into ``sensor``.
         """
         if self.geometry.static:  # without asking the device which points are equal
             return (
@@ -89,8 +116,15 @@ class Pipeline(nn.Module):
         return Surface(spot, *(field.repeat(spots, *[1] * (field.dim() - 1)) for field in seen[1:]))
 
     def render(self, intensity: Tensor, albedo: Tensor, spots: Tensor) -> tuple[Tensor, Surface, Tensor]:
-        """H_r ``[S, T]`` from the gate's last bin down to bin 0, the surface and its albedo, for a given
-        volume.
+        """Transients of a given volume before the laser-sensor response.
+
+        Args:
+            intensity: ``[nz, nx, ny]`` I_pf, unit maximum.
+            albedo: ``[nz, nx, ny]`` ρ.
+            spots: ``[S]`` long, rows of the capture.
+
+        Returns:
+            H_r ``[S, T]`` over bins 0 … gate's end, the surface, and its albedo ``[K]``.
         """
         laser, sensor = self.laser[spots], self.sensor[spots]
         surface = self.surface(intensity, sensor, self.sensor_normal[spots])

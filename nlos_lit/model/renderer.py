@@ -1,6 +1,4 @@
-"""Transient rendering of the implicit surface (Sec. 3.2, 4.3, Eq. 5-9): third-bounce paths laser → x_g →
-sensor.
-"""
+"""Transient rendering of the implicit surface: paths laser → x_g → sensor (paper Sec. 3.2, 4.3, Eq. 5-9)."""
 
 from __future__ import annotations
 
@@ -22,7 +20,9 @@ class TransientRenderer(nn.Module):
     intensity I_l.
 
     Args:
-        n_bins: T; bin_length, t_start: of the capture, m.
+        n_bins: T, bins of the transients.
+        bin_length: path length of a bin, m.
+        t_start: path length at the start of bin 0, m.
         rays: number of rays over the hemisphere (n²).
         splat_sigma: σ_t in bins.
         conserve_energy: normalise each path's splat (see :func:`~nlos_lit.functional.splat.gaussian_splat`).
@@ -52,7 +52,19 @@ class TransientRenderer(nn.Module):
         sensor: Tensor,
         sensor_normal: Tensor,
     ) -> Tensor:
-        """Args: albedo ``[K]`` at the surface points; wall points and normals ``[S, 3]`` of the batch."""
+        """Transients of a batch of S spots.
+
+        Args:
+            surface: K points seen from the sensor's wall points.
+            albedo: ``[K]`` ρ at the surface points.
+            laser: ``[S, 3]`` illuminated wall points, m.
+            laser_normal: ``[S, 3]`` unit normals there.
+            sensor: ``[S, 3]`` observed wall points, m.
+            sensor_normal: ``[S, 3]`` unit normals there.
+
+        Returns:
+            H_r ``[S, T]``, 1/m² times the solid angle.
+        """
         spot = surface.spot
         contribution = (
             albedo
@@ -67,8 +79,25 @@ class TransientRenderer(nn.Module):
 
 
 def throughput(surface: Surface, laser: Tensor, laser_normal: Tensor, sensor_normal: Tensor) -> Tensor:
-    """``cosθ_1 cosθ_2 cosθ_4 / d_lg²`` per path ``[K]``, 1/m²; absolute cosines as in Eq. 6, wall points per
-    path ``[K, 3]``.
+    """Throughput ``cosθ_1 cosθ_2 cosθ_4 / d_lg²`` of paths, with absolute cosines as in the paper's Eq. 6.
+
+    Args:
+        surface: K points seen from the sensor's wall points.
+        laser: ``[K, 3]`` illuminated wall point of each path, m.
+        laser_normal: ``[K, 3]`` unit normals there.
+        sensor_normal: ``[K, 3]`` unit normals at the observed wall points.
+
+    Returns:
+        ``[K]`` 1/m².
+
+    Examples:
+        A point 2 m straight ahead of a confocal spot, facing it: 1/d².
+
+        >>> import torch
+        >>> up, origin = torch.tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 3)
+        >>> ahead = Surface(torch.tensor([0]), torch.tensor([2.0]), up, 2 * up, -up)
+        >>> throughput(ahead, origin, up, up)
+        tensor([0.2500])
     """
     ray = surface.point - laser
     leg = torch.linalg.vector_norm(ray, dim=1)
