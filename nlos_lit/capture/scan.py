@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.background import quietest_level
 
 
 @dataclass(frozen=True)
@@ -69,8 +70,6 @@ class Scan:
         first, last = capture.gate
         kept = capture.counts[:, :last]
         mean = kept[:, first:].mean(axis=0, dtype=np.float64)
-        width = max(1, len(mean) // 16)
-        background = float(np.convolve(mean, np.ones(width) / width, mode="valid").min())
         return Scan(
             places=tuple((p[:, :2] - (low + high) / 2) / half for p in moving),
             half=half,
@@ -83,5 +82,5 @@ class Scan:
             n_bins=last,
             gate=capture.gate,
             mean_counts=float(kept.sum(dtype=np.float64) / capture.n_spots),
-            background=max(background, 1e-3 * float(mean.mean())),
+            background=max(quietest_level(torch.from_numpy(mean)), 1e-3 * float(mean.mean())),
         )

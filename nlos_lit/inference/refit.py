@@ -10,8 +10,8 @@ from torch import Tensor
 
 from nlos_lit.inference.joint_step import best_start
 from nlos_lit.inference.per_spot import factors, solve, sparse, spot_scores
-from nlos_lit.inference.result import Scores
 from nlos_lit.inference.screen import Candidate
+from nlos_lit.metrics.transients import Scores
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.surfels.refine import score_spots
 
@@ -79,5 +79,4 @@ def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> 
 
 def score(fit: SurfelFit, spots: np.ndarray) -> Scores:
     """Deviance and NMSE of spots, with their noise levels."""
-    found = score_spots(fit.model, fit.capture, torch.from_numpy(spots), fit.extension)
-    return Scores(found.deviance_per_bin, found.deviance_noise, found.nmse, found.nmse_noise_floor)
+    return score_spots(fit.model, fit.capture, torch.from_numpy(spots), fit.extension)

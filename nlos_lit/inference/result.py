@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
+from nlos_lit.io.files import plain
+from nlos_lit.metrics.transients import Scores
 
 
 @dataclass(frozen=True)
@@ -76,16 +78,6 @@ class Unexplained:
 
 
 @dataclass(frozen=True)
-class Scores:
-    """How well a set of spots is explained; ``noise`` levels are what the truth would score."""
-
-    deviance_per_bin: float
-    deviance_noise: float
-    nmse: float
-    nmse_noise: float
-
-
-@dataclass(frozen=True)
 class Profile:
     """Signed residual significance along one axis, before and after the extension.
 
@@ -123,18 +115,4 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-serialisable."""
-        return _plain(dataclasses.asdict(self))
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+        return plain(self)

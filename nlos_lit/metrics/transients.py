@@ -3,9 +3,45 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well transients are explained, and what the truth itself would score.
+
+    Args:
+        deviance_per_bin: mean Poisson deviance of a bin.
+        deviance_noise: of counts drawn from the rendering itself, see :func:`expected_deviance`.
+        nmse: see :func:`nmse`.
+        nmse_noise_floor: see :func:`nmse_noise_floor`.
+    """
+
+    deviance_per_bin: float
+    deviance_noise: float
+    nmse: float
+    nmse_noise_floor: float
+
+
+def transient_scores(counts: Tensor, expected: Tensor) -> Scores:
+    """All scores of rendered transients.
+
+    Args:
+        counts: ``[S, T]`` measured photon counts.
+        expected: ``[S, T]`` rendered counts, positive where ``counts`` are.
+
+    Returns:
+        scores with their noise levels.
+    """
+    return Scores(
+        deviance_per_bin=poisson_deviance(counts, expected).mean().item(),
+        deviance_noise=expected_deviance(expected).item(),
+        nmse=nmse(counts, expected).item(),
+        nmse_noise_floor=nmse_noise_floor(counts).item(),
+    )
 
 
 def nmse(measured: Tensor, rendered: Tensor) -> Tensor:

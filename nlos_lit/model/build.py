@@ -10,6 +10,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import spot_spacing
+from nlos_lit.capture.background import quietest_level
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.model.albedo import FreeAlbedo, ResidualAlbedo
@@ -26,21 +27,36 @@ SPEED_M_PER_PS = 299_792_458e-12
 
 @dataclass(frozen=True)
 class PipelineSettings:
-    """Everything about the model that is not the capture; conf/model documents the profiles.
+    """Everything about the model that is not the capture.
+
+    These are the defaults; ``conf/model`` holds what its profiles change (docs/model.md says why).
 
     Args:
-        threshold: intensity below which a ray meets no surface.
-        rays: n of the n × n rays of a spot.
+        threshold: share of the largest intensity below which a ray meets no surface.
+        rays: n of the n × n rays of a spot (the paper's batch: 32 spots × 40 000 rays).
         step_bins: spacing of ray samples in bins of path there and back (1: half a bin length).
-        beta, fine, relative_beta: of the softargmax, see :class:`~nlos_lit.model.geometry.ImplicitGeometry`.
-        power, depth_exponent: of the intensity, see :class:`~nlos_lit.model.phasor.PhasorImaging`.
-        wavelength: default wavelength λ in m; None takes four spot spacings.
-        wavelength_start, sigma_start: factors on λ and on 4λ/6 that give the start of 2π/Ω_pf and σ_pf.
-        wavelength_range, sigma_range: bounds, as factors on the start values.
-        albedo: "free" or "residual"; albedo_start for the former.
-        splat_sigma, conserve_energy, subtract_splat: see renderer and laser-sensor model.
-        jitter_fwhm_ps, decay_per_bin: start of σ_ls (as FWHM) and κ_s.
-        background_start: start of η_s as a fraction of the normalisation; None estimates it from the capture.
+        beta: of the softargmax along a ray, see :class:`~nlos_lit.model.geometry.ImplicitGeometry`.
+        fine: samples a step around a ray's largest sample; 1: none, depth is then quantised to half a bin.
+        relative_beta: ``beta`` acts on intensities relative to the ray's largest.
+        power: of the field in I = z^depth_exponent |u|^power / max, see
+            :class:`~nlos_lit.model.phasor.PhasorImaging`.
+        depth_exponent: of the depth z in the same.
+        wavelength: default wavelength λ, m; None takes four spot spacings.
+        wavelength_start: factor on λ that gives the start of 2π/Ω_pf.
+        sigma_start: factor on 4λ/6 that gives the start of σ_pf.
+        wavelength_range: bounds of 2π/Ω_pf, as factors on its start.
+        sigma_range: bounds of σ_pf, as factors on its start.
+        albedo: ``free``, one value a voxel, or ``residual``, clamp(mask (I + δ), 0, 1).
+        albedo_start: start value of the former.
+        splat_sigma: standard deviation of a path's Gaussian in time, bins.
+        conserve_energy: each path's splat sums to its energy; else its peak is one (Sec. 4.3).
+        subtract_splat: σ_ls is the physical width, the splat's is taken out of Ψ; else Ψ comes on top of the
+            splat (Eq. 9).
+        jitter_fwhm_ps: start of σ_ls, as full width at half maximum, ps.
+        decay_per_bin: start of κ_s, 1/bin.
+        background_start: start of η_s as a fraction of the normalisation; None takes the quietest sixteenth of
+            the gate.
+        basis_tolerance: relative error of the virtual spectrum in the stored basis.
     """
 
     threshold: float
@@ -54,7 +70,7 @@ class PipelineSettings:
     wavelength: float | None = None
     wavelength_start: float = 0.8
     sigma_start: float = 1.2
-    wavelength_range: tuple[float, float] = (2 / 3, 2.0)
+    wavelength_range: tuple[float, float] = (0.6667, 2.0)
     sigma_range: tuple[float, float] = (0.33, 1.5)
     albedo: str = "free"
     albedo_start: float = 0.5
@@ -68,8 +84,17 @@ class PipelineSettings:
 
 
 def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSettings) -> Pipeline:
-    """Submodules with start values as in the paper and its code; call ``pipeline.phasor.prepare`` and
-    ``match_energy`` next.
+    """Submodules with start values as in the paper and its code.
+
+    ``pipeline.phasor.prepare`` and :func:`match_energy` come next.
+
+    Args:
+        capture: what is fitted.
+        grid: the volume.
+        settings: of the model.
+
+    Returns:
+        The simulated measurement of the capture's spots.
 
     Raises:
         UserError: a setting is impossible.
@@ -119,9 +144,8 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
     smallest = LaserSensor.smallest_sigma(s.splat_sigma) if s.subtract_splat else 0.05
     jitter = max(s.jitter_fwhm_ps / FWHM * SPEED_M_PER_PS / bin_length, 1.05 * smallest)
     scale = normalisation(capture)
-    background = (
-        s.background_start * scale if s.background_start is not None else estimate_background(capture)
-    )
+    mean = torch.from_numpy(capture.gated_counts().mean(axis=0, dtype=np.float64))
+    background = quietest_level(mean) if s.background_start is None else s.background_start * scale
     background = min(max(background, 2e-6 * scale), 0.5 * scale)
     laser_sensor = LaserSensor(
         bin_length=bin_length,
@@ -138,7 +162,14 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
 
 
 def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
-    """Counts that the loss counts as 1: the quantile of the gated bins.
+    """Counts that the loss counts as 1: a quantile of the gated bins.
+
+    Args:
+        capture: what is fitted.
+        quantile: 0 … 1; just below 1, so that single hot bins do not set the scale.
+
+    Returns:
+        Counts a bin, above 0.
 
     Raises:
         UserError: the gate holds no photons to speak of.
@@ -149,24 +180,20 @@ def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
     if scale == 0:
         first, last = capture.gate
         raise UserError(
-            f"the gate [{first}, {last}) holds no photons; the counts lie in other bins, so set the gate to theirs"
+            f"the gate [{first}, {last}) holds no photons; the counts lie in other bins, "
+            "so set the gate to theirs"
         )
     return scale
 
 
-def estimate_background(capture: Capture) -> float:
-    """Counts per bin that are there without the scene: the lowest mean over a sixteenth of the gate, all
-    spots together.
-    """
-    mean = capture.gated_counts().mean(axis=0, dtype=np.float64)
-    width = max(1, len(mean) // 16)
-    smooth = np.convolve(mean, np.ones(width) / width, mode="valid")
-    return float(smooth.min())
-
-
 @torch.no_grad()
 def match_energy(pipeline: Pipeline, capture: Capture, spots: torch.Tensor) -> None:
-    """Set I_l so that rendered and measured energy agree over ``spots`` at the start.
+    """Set I_l so that rendered and measured energy agree at the start.
+
+    Args:
+        pipeline: its phasor field prepared; changed in place.
+        capture: what is fitted.
+        spots: ``[S]`` rows of it that are compared.
 
     Raises:
         UserError: no ray of these spots meets the threshold.

@@ -17,22 +17,34 @@ from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.io.files import whole_file, write_json
 from nlos_lit.report.diagnosis_figures import by_gain, diagnosis_figures
 from nlos_lit.report.page_style import CSS
-from nlos_lit.report.quantities import NONE, amount, number, percent, probability, quantity
+from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, probability, quantity
 from nlos_lit.report.style import save_figure
-from nlos_lit.report.verdict import barely, invisible, misfit, missing, rivals, sureness, tone, verdict
+from nlos_lit.report.verdict import (
+    barely,
+    indistinguishable,
+    invisible,
+    misfit,
+    missing,
+    sureness,
+    tone,
+    verdict,
+)
 from nlos_lit.report.words import AXES, describe
 
 CAPTIONS = {
-    "residual_time": "Residual along time, all spots together: how many standard deviations the counts lie above the simulation.",
+    "residual_time": "Residual along time, all spots together: how many standard deviations the counts lie"
+    " above the simulation.",
     "residual_depth": "Residual along depth.",
     "residual_wall": "Residual over the wall, as seen from the wall.",
     "residual_scan": "Residual in the order in which the spots were recorded.",
     "residual_rate": "Residual against how bright a spot is.",
-    "deviance": "Misfit after each accepted effect, and on spots that nothing was chosen with. Grey: only counting noise is left.",
+    "deviance": "Misfit after each accepted effect, and on spots that nothing was chosen with. Grey: only"
+    " counting noise is left.",
     "effects": "Parameters of the accepted effects.",
     "screening": "What every known effect would explain by itself, before any was accepted.",
     "detection_limits": "How strong each effect would have to be to show in this capture.",
-    "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted inside it.",
+    "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted"
+    " inside it.",
     "witness_tail": "The direct pulse's own decay against the tail that was fitted inside the gate.",
 }
 FACTS = {
@@ -50,11 +62,15 @@ class Markup(str):
 def write_report(
     diagnosis: Diagnosis, folder: Path | str, extra_figures: Mapping[str, Figure] | None = None
 ) -> Path:
-    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png`` into ``folder``;
-    returns the page's path.
+    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png``.
 
     Args:
+        diagnosis: that is shown.
+        folder: for the files.
         extra_figures: further figures by name, shown at the end.
+
+    Returns:
+        The page's path.
 
     Raises:
         ValueError: an extra figure has the name of one of the diagnosis's own.
@@ -77,14 +93,28 @@ def write_report(
 
 
 def log_figures(folder: Path | str, figures: Mapping[str, Figure]) -> None:
-    """The figures in TensorBoard: an event file in ``folder/tensorboard``."""
+    """The figures in TensorBoard.
+
+    Args:
+        folder: gets an event file in its ``tensorboard``.
+        figures: by name.
+    """
     with SummaryWriter(Path(folder) / "tensorboard") as writer:
         for name, figure in figures.items():
             writer.add_figure(f"diagnosis/{name}", figure)
 
 
 def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Iterable[str] = ()) -> str:
-    """The page; ``images`` by figure name, of which ``extra`` go to the end."""
+    """The page.
+
+    Args:
+        diagnosis: that is shown.
+        images: HTML of the figures, by name.
+        extra: names of those that go to the end.
+
+    Returns:
+        HTML that needs nothing but itself.
+    """
 
     def shown(*starts: str) -> str:
         return "".join(
@@ -179,10 +209,12 @@ def _accepted_row(diagnosis: Diagnosis, effect: Accepted) -> list[Any]:
     gain = effect.heldout_gain
     low, high = gain.ci95
     held = (
-        f"<b>{number(gain.nats_per_photon)}</b> nats a photon <small>95 %: {number(low)} … {number(high)}</small>"
-        f"<div>deviance per bin {number(gain.deviance_per_bin_before, 4)} → {number(gain.deviance_per_bin_after, 4)}</div>"
+        f"<b>{number(gain.nats_per_photon)}</b> nats a photon"
+        f" <small>95 %: {number(low)} … {number(high)}</small>"
+        f"<div>deviance per bin {number(gain.deviance_per_bin_before, 4)} →"
+        f" {number(gain.deviance_per_bin_after, 4)}</div>"
     )
-    others = list(dict.fromkeys([*rivals(diagnosis, effect.name), *effect.confusable_with]))
+    others = list(dict.fromkeys([*indistinguishable(diagnosis, effect.name), *effect.confusable_with]))
     confused = f"{_text(', '.join(others) or 'nothing')}" + (
         f"<div><small>split by: {_text(effect.split_by)}</small></div>" if effect.split_by else ""
     )
@@ -195,11 +227,12 @@ def _remedies(diagnosis: Diagnosis) -> str:
     names = dict.fromkeys(
         [*(e.name for e in diagnosis.effects), *(n for group in diagnosis.groups for n in group)]
     )
-    words = [(describe(n), n) for n in names]
+    words = [(describe(n).words, n) for n in names]
     return (
         "<dl>"
         + "".join(
-            f"<dt>{_text(_capital(w.phrase))} <small>{_text(n)}</small></dt><dd>{_text(w.cause)} <b>{_text(w.remedy)}</b></dd>"
+            f"<dt>{_text(_capital(w.phrase))} <small>{_text(n)}</small></dt>"
+            f"<dd>{_text(w.cause)} <b>{_text(w.remedy)}</b></dd>"
             for w, n in words
         )
         + "</dl>"
@@ -229,7 +262,7 @@ def _scores(diagnosis: Diagnosis) -> str:
     return _table(
         heads,
         [
-            [n, *(number(v, 4) for v in (s.deviance_per_bin, s.deviance_noise, s.nmse, s.nmse_noise))]
+            [n, *(number(v, 4) for v in (s.deviance_per_bin, s.deviance_noise, s.nmse, s.nmse_noise_floor))]
             for n, s in rows.items()
         ],
     )
@@ -245,7 +278,8 @@ def _screened(diagnosis: Diagnosis) -> str:
         )
         kept = percent(one.retained_information) + (" (barely identifiable)" if barely(one) else "")
         title = Markup(
-            f"{_text(one.name)}{' <b>✔</b>' if one.name in accepted else ''}<br><small>{_text(describe(one.name).phrase)}</small>"
+            f"{_text(one.name)}{' <b>✔</b>' if one.name in accepted else ''}<br>"
+            f"<small>{_text(describe(one.name).phrase)}</small>"
         )
         rows.append(
             [
@@ -268,7 +302,10 @@ def _screened(diagnosis: Diagnosis) -> str:
         "First estimate",
     ]
     kept = "what is left of an effect's trace once scene, albedo and response have adapted"
-    rule = "A small p alone is not enough: an accepted effect also gains on held-out blocks, and beats its rivals."
+    rule = (
+        "A small p alone is not enough:"
+        " an accepted effect also gains on held-out blocks, and beats its rivals."
+    )
     return f"<p>Ranked by predicted gain. ✔ accepted. {rule} Retained information: {kept}.</p>" + _table(
         heads, rows
     )
@@ -301,12 +338,12 @@ def _witness(diagnosis: Diagnosis) -> str:
     if r is not None:
         rows.append(["Correlation of the fitted wall gain with it (1: the same, 0: unrelated)", number(r)])
     if fitted is not None:
-        rows.append(["Decay of the fitted tail", amount("irf_tail", "decay", fitted, None)])
+        rows.append(["Decay of the fitted tail", amount_of("time", fitted)])
     if direct:
         rows.append(
             [
                 "Decay of the direct pulse, early to late",
-                " … ".join(amount("irf_tail", "decay", v, None) for v in direct),
+                " … ".join(amount_of("time", v) for v in direct),
             ]
         )
     return "<p>It lies outside the gate; no fit has used it.</p>" + _table(["Witness", "Value"], rows)
@@ -347,7 +384,8 @@ def _image(name: str, png: bytes) -> Markup:
     base = CAPTIONS.get(name) or CAPTIONS.get(re.sub(r"_\d+$", "", name)) or name.replace("_", " ")
     data = base64.b64encode(png).decode("ascii")
     return Markup(
-        f'<figure><img alt="{_text(base)}" src="data:image/png;base64,{data}"><figcaption>{_text(base)}</figcaption></figure>'
+        f'<figure><img alt="{_text(base)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{_text(base)}</figcaption></figure>"
     )
 
 

@@ -12,6 +12,8 @@ from nlos_lit.capture.errors import MemoryBudgetError, UserError
 _BINARY = {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 _DECIMAL = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS = _BINARY | _DECIMAL
+# What makes the phasor field smaller.
+SMALLER = "sum spots or bins (scene.sum_spots, scene.sum_bins) or take fewer depth planes (scene.volume.depth_pitch)"
 
 
 def parse_bytes(text: str | int | float) -> int:
@@ -22,8 +24,13 @@ def parse_bytes(text: str | int | float) -> int:
     return int(float(match[1]) * _UNITS[match[2].upper()])
 
 
-def check_machine(needed: int, what: str) -> None:
+def check_machine(needed: int, what: str, smaller: str = SMALLER) -> None:
     """Refuse what the machine cannot hold.
+
+    Args:
+        needed: bytes.
+        what: takes them.
+        smaller: what would take less, for the message.
 
     Raises:
         MemoryBudgetError: more than the memory that is free now.
@@ -33,9 +40,7 @@ def check_machine(needed: int, what: str) -> None:
     free = psutil.virtual_memory().available
     if needed > free:
         raise MemoryBudgetError(
-            f"{what} needs about {needed / 2**30:.1f} GiB, this machine has {free / 2**30:.1f} GiB free; "
-            "sum spots or bins (scene.sum_spots, scene.sum_bins), take fewer depth planes (scene.volume.depth_pitch) "
-            "or a smaller batch_spots"
+            f"{what} needs about {needed / 2**30:.1f} GiB, this machine has {free / 2**30:.1f} GiB free; {smaller}"
         )
 
 

@@ -16,7 +16,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
-from nlos_lit.metrics.transients import expected_deviance, poisson_deviance
+from nlos_lit.metrics.transients import transient_scores
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel
@@ -78,10 +78,11 @@ class RefineSettings:
 
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
-            raise UserError("refine.rounds, steps, batch, per_cell and test_spots must be at least 1")
+            raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
         if not 0 < self.floor < 1 or self.tie < 0:
             raise UserError(
-                f"refine.floor must lie between 0 and 1 and refine.tie be 0 or more; found {self.floor} and {self.tie}"
+                "surfels.floor must lie between 0 and 1 and surfels.tie be 0 or more; "
+                f"found {self.floor} and {self.tie}"
             )
 
 
@@ -242,9 +243,8 @@ class SurfelFit:
     def _deviance(self) -> tuple[float, float]:
         """Per bin of the tested rows, and what noise alone would make."""
         expected = self.model.expected(self.train[self.tested], self.extension)
-        return float(poisson_deviance(self.counts[self.tested], expected).mean()), float(
-            expected_deviance(expected)
-        )
+        scores = transient_scores(self.counts[self.tested], expected)
+        return scores.deviance_per_bin, scores.deviance_noise
 
     def _round(self, left: int, settling: bool, steps: int) -> Iterator[float]:
         s, model = self.settings, self.model

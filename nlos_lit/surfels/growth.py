@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.background import quietest_level
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
@@ -34,7 +35,7 @@ from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 CHUNK = 1 << 21  # paths at a time
-EXACT = "donot_use_mm_for_euclid_dist"
+EXACT = "donot_use_mm_for_euclid_dist"  # distances as differences: products cancel for near points
 
 
 class Seeds(NamedTuple):
@@ -118,9 +119,7 @@ def start_response(capture: Capture, counts: Tensor, start: LaserSensor | None) 
     smallest = math.sqrt(SPLINE_VARIANCE + 0.05**2) * length
     sigma = max(1.2 * length if start is None else float(start.sigma_ls().detach()), 1.05 * smallest)
     kappa = 0.7 / length if start is None else float(start.kappa_s().detach())
-    mean = counts.mean(0)
-    width = max(1, len(mean) // 16)
-    lowest = float(mean.unfold(0, width, 1).mean(1).min())
+    lowest = quietest_level(counts.mean(0))
     brightest = float(counts.max())
     background = min(max(lowest, 2e-6 * brightest), 0.5 * brightest)
     return spline_sensor(
@@ -220,10 +219,7 @@ def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096
     """``[V]`` True where a surfel lies within ``reach`` (m) of the candidate."""
     if len(centre) == 0 or len(candidates) == 0:
         return torch.zeros(len(candidates), dtype=torch.bool, device=candidates.device)
-    near = [
-        torch.cdist(p, centre, compute_mode="donot_use_mm_for_euclid_dist").min(1).values < reach
-        for p in candidates.split(chunk)
-    ]
+    near = [torch.cdist(p, centre, compute_mode=EXACT).min(1).values < reach for p in candidates.split(chunk)]
     return torch.cat(near)
 
 

@@ -20,7 +20,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.io.points import Points
-from nlos_lit.metrics.transients import expected_deviance, nmse, nmse_noise_floor, poisson_deviance
+from nlos_lit.metrics.transients import Scores, transient_scores
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.runtime.memory import check_machine
@@ -31,16 +31,6 @@ from nlos_lit.surfels.model import Lateral, SurfelModel
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
 RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
-
-
-@dataclass(frozen=True)
-class Scores:
-    """How well spots are explained: ``noise_floor`` and ``noise`` are what the truth itself would score."""
-
-    nmse: float
-    nmse_noise_floor: float
-    deviance_per_bin: float
-    deviance_noise: float
 
 
 @dataclass(frozen=True)
@@ -139,17 +129,20 @@ def _run_scanning_shapes(fit: SurfelFit, progress: Progress | None) -> list[dict
 
 @torch.no_grad()
 def score_spots(model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hooks = NOTHING) -> Scores:
-    """Scores of ``spots`` with their noise levels."""
+    """Scores of some spots with their noise levels.
+
+    Args:
+        model: fitted surfels.
+        capture: whose gated counts are compared.
+        spots: ``[S]`` rows of the capture.
+        hooks: effects that act on the expected counts.
+
+    Returns:
+        means over the spots' gated bins.
+    """
     first, last = capture.gate
     counts = torch.from_numpy(capture.counts[spots.numpy(), first:last].astype(np.float32))
-    expected = model.expected(spots, hooks)
-    values = (
-        nmse(counts, expected),
-        nmse_noise_floor(counts),
-        poisson_deviance(counts, expected).mean(),
-        expected_deviance(expected),
-    )
-    return Scores(*(v.item() for v in values))
+    return transient_scores(counts, model.expected(spots, hooks))
 
 
 def _seeded(
@@ -190,12 +183,13 @@ def _seeded(
     if not keep.any():
         raise UserError(
             f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold only noise, or "
-            "scene.volume.depth or the gate misses the hidden scene (refine.significance sets the level)"
+            "scene.volume.depth or the gate misses the hidden scene (surfels.significance sets the level)"
         )
     best = significance.topk(min(s.max_seeds, len(significance))).indices
     seeds = candidates.take(keep)
     step_bytes = int(keep.sum()) * points**2 * min(s.batch, len(train)) * BYTES_PER_PATH
-    check_machine(step_bytes + 8 * counts.numel(), "one refinement step")
+    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
+    check_machine(step_bytes + 8 * counts.numel(), "one refinement step", smaller)
     model = SurfelModel(
         capture, centre=seeds.centre, normal=seeds.normal, albedo=value[keep] / value[keep].mean(), lateral=lateral,
         laser_sensor=sensor, quadrature=points,

@@ -93,7 +93,7 @@ def test_log_likelihood_and_scores_by_hand():
     )
     assert found.deviance_per_bin == pytest.approx(deviance.mean(), rel=1e-5)
     assert found.nmse == pytest.approx(((counts - expected) ** 2).sum() / (counts**2).sum(), rel=1e-5)
-    assert found.nmse_noise == pytest.approx(counts.sum() / (counts**2).sum(), rel=1e-5)
+    assert found.nmse_noise_floor == pytest.approx(counts.sum() / (counts**2).sum(), rel=1e-5)
 
 
 def test_a_step_moves_all_amplitudes_in_order():
