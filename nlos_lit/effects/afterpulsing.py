@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import convolve, geometric
 
 
@@ -28,16 +32,31 @@ class Afterpulsing(Effect):
     """
 
     name = "afterpulsing"
-    stage = "counting"
+    words = EffectWords(
+        phrase="afterpulsing (counts that trigger further counts)",
+        cause="Carriers trapped in the detector are released later and are counted again.",
+        remedy="Lengthen the hold-off time, lower the excess bias, or warm the detector a little.",
+        headline="{probability} of the counts, τ = {decay}",
+    )
+    split_by: ClassVar = {
+        "irf_tail": "a dark or ambient-only record: afterpulses follow background counts, a slow tail does "
+        "not",
+        "background_slope": "a capture with the laser off",
+    }
+    witness = "tail"
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         bins = scan.bin_length
         decays = geometric(4 * bins, 0.75 * bins * scan.n_bins, 7)
         return (
-            Parameter("probability", "1", 0.0, 0.05, 0.0, 0.9),
+            Parameter("probability", "1", 0.0, 0.05, 0.0, 0.9, kind="percent"),
             Parameter("decay", "m", None, 0.2, bins, 4 * bins * scan.n_bins, grid=decays, log=True),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"probability": 0.1}
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         rate = self.scan.bin_length / self.value("decay")

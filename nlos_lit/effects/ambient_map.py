@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Parameter
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_wall
+from nlos_lit.effects.words import EffectWords
 
 
 class AmbientMap(SmoothEffect):
@@ -28,7 +29,12 @@ class AmbientMap(SmoothEffect):
     """
 
     name = "ambient_map"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a background that differs over the wall",
+        cause="Lamps, windows or screens light parts of the wall.",
+        remedy="Shield the wall or use a narrower filter; keep the map where you cannot.",
+        headline="{rms} rms over the wall",
+    )
     coefficients = "level_map"
 
     @classmethod
@@ -37,7 +43,11 @@ class AmbientMap(SmoothEffect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return cls.coefficient(scan, "1", 0.1, 1.5, 0.7)
+        return cls.coefficient(scan, "1", 0.1, 1.5, 0.7, kind="percent")
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"rms": 0.3}
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         return background * torch.exp(self.field(spots))[:, None]

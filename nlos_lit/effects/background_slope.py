@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 
 
 class BackgroundSlope(Effect):
@@ -26,11 +28,21 @@ class BackgroundSlope(Effect):
     """
 
     name = "background_slope"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a background that rises or falls over the time gate",
+        cause="Slow light (fluorescence, the laser's pedestal) or a detector that recovers after the "
+        "direct pulse.",
+        remedy="Record once with the hidden scene covered, and subtract nothing but model that shape.",
+        headline="{slope} from the middle of the gate to its end",
+    )
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("slope", "1", 0.0, 0.05, -0.95, 0.95),)
+        return (Parameter("slope", "1", 0.0, 0.05, -0.95, 0.95, kind="percent"),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"slope": 0.5}
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate

@@ -5,7 +5,9 @@ from __future__ import annotations
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -26,12 +28,20 @@ class ClockScale(Effect):
     """
 
     name = "clock_scale"
-    stage = "time"
-    needs_paths = True
+    words = EffectWords(
+        phrase="a time axis that is stretched",
+        cause="The true width of a time bin is not the nominal one.",
+        remedy="Calibrate the bin width with a known delay or with the laser's repetition period.",
+        headline="bins {scale} wider than stated",
+    )
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("scale", "1", 0.0, 0.01, -0.3, 0.3),)
+        return (Parameter("scale", "1", 0.0, 0.01, -0.3, 0.3, kind="percent"),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"scale": 0.02}
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.value("scale") * (length - self.scan.middle)

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import geometric
 
 
@@ -29,7 +31,12 @@ class DirectLeak(Effect):
     """
 
     name = "direct_leak"
-    stage = "spot"
+    words = EffectWords(
+        phrase="direct light that leaks into the gate",
+        cause="The end of the very bright first return is still there when the gate opens.",
+        remedy="Open the gate later, or block the direct path between laser spot and detector.",
+        headline="{amplitude} when the gate opens, τ = {decay}",
+    )
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
@@ -48,6 +55,10 @@ class DirectLeak(Effect):
                 log=True,
             ),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"amplitude": 5 * scan.background}
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate

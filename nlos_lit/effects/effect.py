@@ -1,79 +1,58 @@
-"""What every effect is: a module with declared parameters that acts at one or more stages of the forward
-model.
-"""
+"""What every effect is: a module with declared parameters that acts on the simulated measurement."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.hooks import Hooks
+from nlos_lit.effects.hooks import OF_PATHS, STAGE_OF_HOOKS, Hooks, overridden
+from nlos_lit.effects.parameter import Number, Parameter, Quantity
+from nlos_lit.effects.words import EffectWords
 
 STAGES = ("path", "time", "response", "spot", "counting")
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of an effect.
-
-    Args:
-        unit: SI unit, ``1`` for pure numbers.
-        null: value at which the effect is absent; None for a shape (a delay, a decay) that means nothing at
-            the null …
-        grid: … and is therefore scanned over these values.
-        scale: a noticeable change: stored values count in it.
-        lower, upper: bounds.
-        size: number of coefficients; they share null, scale and bounds.
-        log: shape that is stored as its logarithm (``scale`` is then a change of the logarithm).
-        prior: standard deviation of each coefficient around the null, in its unit, for those that spots alone
-            may not settle.
-    """
-
-    name: str
-    unit: str
-    null: float | None
-    scale: float
-    lower: float
-    upper: float
-    size: int = 1
-    grid: tuple[float, ...] = ()
-    log: bool = False
-    prior: tuple[float, ...] = ()
-
-
-class Quantity(NamedTuple):
-    """A number worth reporting, differentiable by the effect's parameters; ``spots``: it counts spots of the
-    scan.
-    """
-
-    value: Tensor
-    unit: str
-    spots: bool = False
-
-
 class Effect(nn.Module, Hooks):
-    """One physical effect. Subclasses set ``name`` and ``stage``, declare parameters, and override the hooks
-    they need.
+    """One physical effect. Subclasses set ``name`` and ``words``, declare parameters, and override hooks.
 
     Args:
         scan: of the capture.
 
     Attributes:
-        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
-            transients.
+        name: of the effect and of its module.
+        words: for the report.
+        split_by: other effects that leave nearly the same trace, and the measurement that would tell. Of a
+            pair, one says it.
+        witness: what of the direct pulse, which no fit has seen, tells of the effect: its ``energy`` spot by
+            spot (a gain), its ``tail`` (a parameter ``decay``), or nothing.
         per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is
             what is reported.
+        hooks: those that the class overrides. What follows from them:
+        stage: where it acts, one of ``STAGES``.
+        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
+            transients.
     """
 
     name: ClassVar[str]
-    stage: ClassVar[str]
-    needs_paths: ClassVar[bool] = False
+    words: ClassVar[EffectWords | None] = None
+    split_by: ClassVar[Mapping[str, str]] = {}
+    witness: ClassVar[Literal["energy", "tail"] | None] = None
     per_spot: ClassVar[bool] = False
+    hooks: ClassVar[frozenset[str]] = frozenset()
+    stage: ClassVar[str] = ""
+    needs_paths: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.hooks = overridden(cls)
+        cls.stage = next((stage for stage, hooks in STAGE_OF_HOOKS if hooks & cls.hooks), "")
+        cls.needs_paths = bool(cls.hooks & OF_PATHS)
 
     def __init__(self, scan: Scan) -> None:
         super().__init__()
@@ -81,16 +60,19 @@ class Effect(nn.Module, Hooks):
         self.declared = {p.name: p for p in self.declare(scan)}
         for p in self.declared.values():
             self.register_parameter(f"raw_{p.name}", nn.Parameter(torch.zeros(p.size)))
-        self.width, self.share = (
-            0.0,
-            1.0,
-        )  # per-spot effects: of their distribution, and how many spots have it
+        # Per-spot effects: of their distribution, and how many spots have it.
+        self.width, self.share = 0.0, 1.0
         self.prior_scale = 1.0  # of all prior deviations
         self.reset()
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         """Parameters, amplitudes before shapes."""
+        raise NotImplementedError
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        """A strength that is clearly visible, by the names of :meth:`settable`; shapes are left out."""
         raise NotImplementedError
 
     def value(self, name: str) -> Tensor:
@@ -101,7 +83,12 @@ class Effect(nn.Module, Hooks):
 
     @torch.no_grad()
     def set(self, name: str, value: float | Tensor) -> None:
-        """Store a value (or one for each coefficient), kept within the bounds."""
+        """Store a value (or one for each coefficient), kept within the bounds.
+
+        Args:
+            name: of the parameter.
+            value: a scalar or ``[size]``, in the parameter's unit.
+        """
         p = self.declared[name]
         value = torch.as_tensor(value, dtype=torch.float32).clamp(p.lower, p.upper)
         getattr(self, f"raw_{name}").copy_((torch.log(value) if p.log else value) / p.scale)
@@ -123,9 +110,7 @@ class Effect(nn.Module, Hooks):
             self.set(p.name, self.value(p.name))
 
     def precision(self) -> Tensor:
-        """Prior precision of all stored values (amplitudes in order, then shapes): [k], 0 where there is no
-        prior.
-        """
+        """``[k]`` prior precision of all stored values, amplitudes first; 0 where there is no prior."""
         parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]
         return torch.cat(parts) if parts else torch.zeros(0)
 
@@ -145,10 +130,8 @@ class Effect(nn.Module, Hooks):
 
     @property
     def moves_light(self) -> bool:
-        """It moves light in time or scales it, path by path or spot by spot, as errors of places, normals and
-        albedos do.
-        """
-        return any(getattr(type(self), hook) is not getattr(Hooks, hook) for hook in ("path", "time", "gain"))
+        """It moves or scales light by path or spot, as errors of places, normals and albedos do."""
+        return bool(self.hooks & {"path", "time", "gain"})
 
     @property
     def amplitudes(self) -> list[Parameter]:
@@ -169,4 +152,74 @@ class Effect(nn.Module, Hooks):
 
     def quantities(self) -> dict[str, Quantity]:
         """What is reported: every scalar parameter; effects with coefficients override this."""
-        return {p.name: Quantity(self.value(p.name), p.unit) for p in self.declared.values() if p.size == 1}
+        return {
+            p.name: Quantity(self.value(p.name), p.unit, kind=p.kind)
+            for p in self.declared.values()
+            if p.size == 1
+        }
+
+    def numbers(self) -> dict[str, Number]:
+        """Every number that may be said of the effect, parameters first; those reported at times, too."""
+        said = {p.name: p.number for p in self.declared.values()}
+        return said | {name: q.number for name, q in self.quantities().items() if name not in said}
+
+    def settable(self) -> dict[str, str]:
+        """Scalars that can be given, with their units: parameters, or the size of random coefficients."""
+        return {p.name: p.unit for p in self.declared.values()}
+
+    def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
+        """Take on a strength that a user gave; effects with coefficients draw these.
+
+        Args:
+            values: by the names of :meth:`settable`, each in its unit.
+            rng: for what is random.
+
+        Raises:
+            UserError: a value that is out of bounds, or makes no sense.
+        """
+        for name, value in values.items():
+            self.set_given(name, torch.tensor(value, dtype=torch.float64), name)
+
+    def set_given(self, parameter: str, value: Tensor, given: str) -> None:
+        """Store a value that follows from what a user gave.
+
+        Args:
+            parameter: that is set.
+            value: a scalar, or ``[size]`` coefficients that were drawn, in the parameter's unit.
+            given: name of the scalar that the user gave.
+
+        Raises:
+            UserError: a value is out of the parameter's bounds.
+        """
+        p = self.declared[parameter]
+        low, high = float(value.min()), float(value.max())
+        if not (p.lower <= low and high <= p.upper):
+            found = (
+                f"found {high:g}"
+                if value.ndim == 0
+                else f"found values from {low:g} to {high:g} in the field drawn; take it smaller"
+            )
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            raise UserError(f"{self.name}.{given} must keep within {p.lower:g} … {p.upper:g}{unit}; {found}")
+        self.set(parameter, value.float())
+
+    def given_size(self, values: Mapping[str, float], name: str) -> float:
+        """One of the values given, a size.
+
+        Args:
+            values: by the names of :meth:`settable`.
+            name: of the one.
+
+        Raises:
+            UserError: it is below 0.
+        """
+        if not values[name] >= 0:
+            raise UserError(f"{self.name}.{name} must be 0 or more; found {values[name]:g}")
+        return values[name]
+
+    def settle(self, expected: Tensor) -> None:
+        """In a simulation, before its counting hook: take on what follows from how much light there is.
+
+        Args:
+            expected: ``[S, T]`` photons of all spots.
+        """

@@ -2,32 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import cast
 
 from torch import Tensor, nn
 
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.hooks import Hooks
+from nlos_lit.functional.surfel_paths import Paths
 
 
 class Extension(nn.Module, Hooks):
-    """Several effects as one, each stage in the order given."""
+    """Several effects as one: each hook is that of all effects, one after the other.
 
-    def __init__(self, effects: list[Effect]) -> None:
+    Args:
+        effects: in the order in which they act.
+    """
+
+    effects: Sequence[Effect]
+
+    def __init__(self, effects: Sequence[Effect]) -> None:
         super().__init__()
-        self.effects = nn.ModuleList(effects)
+        self.effects = cast(Sequence[Effect], nn.ModuleList(effects))
 
-    def path(self, contribution: Tensor, paths: Any, spots: Tensor) -> Tensor:
+    def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         for effect in self.effects:
             contribution = effect.path(contribution, paths, spots)
         return contribution
 
-    def time(self, length: Tensor, paths: Any, spots: Tensor) -> Tensor:
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         for effect in self.effects:
             length = effect.time(length, paths, spots)
         return length
 
-    def transients(self, transients: Tensor, energy: Tensor, paths: Any, spots: Tensor) -> Tensor:
+    def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         for effect in self.effects:
             transients = effect.transients(transients, energy, paths, spots)
         return transients
@@ -53,6 +61,7 @@ class Extension(nn.Module, Hooks):
         return expected
 
     def clamp(self) -> None:
+        """Bring every effect's parameters back within their bounds."""
         for effect in self.effects:
             effect.clamp()
 

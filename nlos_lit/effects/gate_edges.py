@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 
 
 class GateEdges(Effect):
@@ -28,14 +32,26 @@ class GateEdges(Effect):
     """
 
     name = "gate_edges"
-    stage = "counting"
+    words = EffectWords(
+        phrase="a time gate with soft edges",
+        cause="The detector is not fully sensitive right after the gate opens and before it closes.",
+        remedy="Fit a narrower gate, or measure its shape with steady light.",
+        headline="{start} lost at the first bin, {end} at the last",
+    )
+    split_by: ClassVar = {
+        "direct_leak": "a capture with the gate opened later",
+    }
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         span = float(scan.gate[1] - scan.gate[0])
         widths = tuple(w for w in (1.5, 4.0, 10.0, 25.0) if w < span / 2) or (1.5,)
-        edges = tuple(Parameter(name, "1", 0.0, 0.1, 0.0, 1.0) for name in ("start", "end"))
+        edges = tuple(Parameter(name, "1", 0.0, 0.1, 0.0, 1.0, kind="percent") for name in ("start", "end"))
         return (*edges, Parameter("width", "bins", None, 0.2, 0.5, max(span, 2.0), grid=widths, log=True))
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"start": 0.5, "end": 0.5}
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import whole_record
 
 
@@ -27,7 +29,14 @@ class GhostPulse(Effect):
     """
 
     name = "ghost_pulse"
-    stage = "response"
+    words = EffectWords(
+        phrase="a second, delayed pulse",
+        cause="A reflection in the optics or a cable, or a post-pulse of the laser, repeats every return "
+        "later.",
+        remedy="Look for the repeat in the direct pulse; tilt filters and windows, terminate cables, or "
+        "move it out of the gate.",
+        headline="{fraction} of the main pulse, {delay} later",
+    )
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
@@ -37,9 +46,13 @@ class GhostPulse(Effect):
             delay = delay + 3 if delay < 40 else 1.06 * delay
         longest = max(scan.n_bins, 5) * scan.bin_length
         return (
-            Parameter("fraction", "1", 0.0, 0.05, 0.0, 1.0),
+            Parameter("fraction", "1", 0.0, 0.05, 0.0, 1.0, kind="percent"),
             Parameter("delay", "m", None, scan.bin_length, scan.bin_length, longest, grid=tuple(delays)),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"fraction": 0.1}
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)

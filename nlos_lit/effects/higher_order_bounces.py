@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Number, Parameter, Quantity
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_paths import Paths, SplineSplat
 
@@ -39,14 +42,25 @@ class HigherOrderBounces(Effect):
     Degenerate with: ``irf_tail``, weak surfels behind the surface, ``background_slope``.
 
     Source: C. M. Goral et al., *Modeling the interaction of light between diffuse surfaces*, SIGGRAPH 1984;
-    the bound for touching
-    surfels: J. R. Wallace, K. A. Elmquist, E. A. Haines, *A ray tracing algorithm for progressive radiosity*,
-        SIGGRAPH 1989.
+    the bound for touching surfels: J. R. Wallace, K. A. Elmquist, E. A. Haines, *A ray tracing algorithm for
+    progressive radiosity*, SIGGRAPH 1989.
     """
 
     name = "higher_order_bounces"
-    stage = "path"
-    needs_paths = True
+    words = EffectWords(
+        phrase="light that bounced twice inside the hidden scene",
+        cause="Surfaces that face each other exchange light, which arrives later than any direct path "
+        "explains.",
+        remedy="Nothing to repair: keep it in the model, or darken one of the facing surfaces.",
+        headline="{share} of the light",
+    )
+    split_by: ClassVar = {
+        "ghost_pulse": "a capture of a single flat target, where no light bounces twice",
+        "irf_tail": "a capture of a single flat target, where no light bounces twice",
+    }
+
+    laser: Tensor
+    sensor: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
@@ -58,12 +72,19 @@ class HigherOrderBounces(Effect):
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         return (Parameter("strength", "1", 0.0, 0.5, 0.0, 50.0),)
 
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"strength": 1.0}
+
     def quantities(self) -> dict[str, Quantity]:
         strength = self.value("strength")
         reported = {"strength": Quantity(strength, "1")}
         if not math.isnan(self.ratio):
-            reported["share"] = Quantity(strength * self.ratio, "1")
+            reported["share"] = Quantity(strength * self.ratio, "1", kind="percent")
         return reported
+
+    def numbers(self) -> dict[str, Number]:
+        return {**super().numbers(), "share": Number("1", "percent")}
 
     def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         fourth = self.fourth_bounce(energy, paths, spots, transients.shape[1])
@@ -72,7 +93,17 @@ class HigherOrderBounces(Effect):
         return transients + self.value("strength") * fourth
 
     def fourth_bounce(self, energy: Tensor, paths: Paths, spots: Tensor, n_bins: int) -> Tensor:
-        """``[B, n_bins]`` light on arrival at strength 1."""
+        """Light on arrival at strength 1.
+
+        Args:
+            energy: ``[B, M, Q]`` of the third bounce.
+            paths: their geometry.
+            spots: ``[B]`` indices into the scan.
+            n_bins: of the record.
+
+        Returns:
+            ``[B, n_bins]``.
+        """
         member, cell = clusters(paths.centre.detach())
         power = energy.sum(2)
         laser, laser_leg = throughput(self.laser[spots], paths)
@@ -105,8 +136,14 @@ def clusters(centre: Tensor) -> tuple[Tensor, float]:
 
 
 def throughput(wall: Tensor, paths: Paths) -> tuple[Tensor, Tensor]:
-    """``cosθ_wall cosθ_surfel/d²`` and d, ``[B, M]``, from wall points ``[B, 3]`` (wall normal +z) to the
-    surfels' centres.
+    """``cosθ_wall cosθ_surfel/d²`` and d, from wall points to the surfels' centres.
+
+    Args:
+        wall: ``[B, 3]`` m; the wall's normal is +z.
+        paths: for the surfels' centres and normals.
+
+    Returns:
+        ``[B, M]`` 1/m², and ``[B, M]`` m.
     """
     away = paths.centre - wall[:, None]
     square = away.square().sum(2)
@@ -115,8 +152,14 @@ def throughput(wall: Tensor, paths: Paths) -> tuple[Tensor, Tensor]:
 
 
 def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
-    """``cosθ cosθ/(d² + A/π)`` (1/m²) and d (m) between clusters, both ``[C, C]``, means over pairs of their
-    surfels by area.
+    """``cosθ cosθ/(d² + A/π)`` and d between clusters, means over pairs of their surfels by area.
+
+    Args:
+        paths: for the surfels' centres, normals and areas.
+        member: ``[M, C]`` ones and zeros, who belongs to which cluster.
+
+    Returns:
+        ``[C, C]`` 1/m², and ``[C, C]`` m.
     """
     rank = (member.cumsum(0) * member).sum(1) - 1
     chosen = torch.nonzero(rank % math.ceil(len(rank) / SAMPLES) == 0)[:, 0]
@@ -136,8 +179,14 @@ def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def blurred(arrivals: Tensor, side: float) -> Tensor:
-    """``[B, T]`` spread in time as over two cells of ``side`` bins: a Gaussian of their joint standard
-    deviation at 45°.
+    """Arrivals spread in time as over two cells: a Gaussian of their joint standard deviation at 45°.
+
+    Args:
+        arrivals: ``[B, T]``.
+        side: of a cell, in bins.
+
+    Returns:
+        ``[B, T]``.
     """
     sigma = max(side / math.sqrt(12), 1e-3)
     lead = math.ceil(3 * sigma)

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import ClassVar
+
+import numpy as np
+import torch
 from torch import Tensor
 
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.words import EffectWords
 
 HOT = 0.25  # of the hottest spot: from there on a spot counts as hot
 
 
 class HotSpots(Effect):
-    """Some spots have a constant background of their own: hot pixels, a bright reflection, interference
-    during their exposure.
+    """Some spots have a background of their own: hot pixels, a bright reflection, interference.
 
     ``background → background + extra_s``, extra ≥ 0 and 0 at most spots
 
@@ -28,15 +35,44 @@ class HotSpots(Effect):
     """
 
     name = "hot_spots"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a few spots with far too much background",
+        cause="Single spots look at a reflection, a status lamp, or were recorded while someone opened a "
+        "door.",
+        remedy="Look at these spots on the wall; mask or record them again.",
+        headline="{number} spots with {level} more",
+    )
+    split_by: ClassVar = {
+        "ambient_map": "a capture with the laser off",
+    }
     per_spot = True
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        typical = scan.mean_counts / scan.n_bins + scan.background
-        return (
-            Parameter("extra", "counts/bin", 0.0, scan.background, 0.0, 1e3 * typical, size=scan.n_spots),
-        )
+        most = 1e3 * (scan.mean_counts / scan.n_bins + scan.background)
+        return (Parameter("extra", "counts/bin", 0.0, scan.background, 0.0, most, size=scan.n_spots),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"level": 5 * scan.background, "number": max(1, round(0.01 * scan.n_spots))}
+
+    def settable(self) -> dict[str, str]:
+        return {"level": "counts/bin", "number": "1"}
+
+    def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
+        """Spots at random, each with 0.5 to 1.5 of the level on average; what is not given is typical."""
+        values, spots = {**self.typical(self.scan), **values}, self.scan.n_spots
+        level, number = self.given_size(values, "level"), values["number"]
+        if number != int(number) or not 1 <= number <= spots:
+            raise UserError(
+                f"hot_spots.number must be a whole number from 1 to the scan's {spots} spots;"
+                f" found {number:g}"
+            )
+        extra = torch.zeros(spots)
+        share = rng.uniform(0.5, 1.5, int(number))
+        hot = torch.from_numpy(rng.permutation(spots)[: int(number)])
+        extra[hot] = torch.from_numpy(level * share / share.mean()).float()
+        self.set_given("extra", extra, "level")
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         return background + self.value("extra").reshape(-1)[spots][:, None]

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import convolve, whole_record
 
 
@@ -28,16 +30,27 @@ class IrfTail(Effect):
     """
 
     name = "irf_tail"
-    stage = "response"
+    words = EffectWords(
+        phrase="a slow detector tail",
+        cause="In a silicon SPAD some carriers are born outside the junction and diffuse into it late.",
+        remedy="Measure the instrument response on the direct pulse and use it; a thinner detector or a "
+        "shorter wavelength has less tail.",
+        headline="{fraction} of the photons, τ = {decay}",
+    )
+    witness = "tail"
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         bins = scan.bin_length
         decays = tuple(bins * d for d in (4.0, 10.0, 25.0, 60.0, 150.0) if d < scan.n_bins / 1.5)
         return (
-            Parameter("fraction", "1", 0.0, 0.05, 0.0, 0.9),
+            Parameter("fraction", "1", 0.0, 0.05, 0.0, 0.9, kind="percent"),
             Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins, grid=decays, log=True),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"fraction": 0.2}
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)

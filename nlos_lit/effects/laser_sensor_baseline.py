@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -27,8 +29,14 @@ class LaserSensorBaseline(Effect):
     """
 
     name = "laser_sensor_baseline"
-    stage = "time"
-    needs_paths = True
+    words = EffectWords(
+        phrase="laser and sensor spots that do not coincide",
+        cause="The detector looks beside the point that the laser lights.",
+        remedy="Realign the two beams on the wall, or give the sensor's true points.",
+        headline="{baseline_x} along x, {baseline_y} along y",
+    )
+
+    sensor: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
@@ -38,8 +46,13 @@ class LaserSensorBaseline(Effect):
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         reach = 0.25 * scan.half
         return tuple(
-            Parameter(name, "m", 0.0, scan.bin_length, -reach, reach) for name in ("baseline_x", "baseline_y")
+            Parameter(name, "m", 0.0, scan.bin_length, -reach, reach, kind="length")
+            for name in ("baseline_x", "baseline_y")
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"baseline_x": 0.05 * scan.half, "baseline_y": 0.0}
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         stated, real = self.legs(paths, spots)
@@ -52,7 +65,15 @@ class LaserSensorBaseline(Effect):
         return length + (real.norm(dim=2) - stated.norm(dim=2))[..., None]
 
     def legs(self, paths: Paths, spots: Tensor) -> tuple[Tensor, Tensor]:
-        """``[B, M, 3]`` from the sensor's stated and its real point to the surfels' centres."""
+        """From the sensor's stated and its real point to the surfels' centres.
+
+        Args:
+            paths: for the centres.
+            spots: ``[B]`` indices into the scan.
+
+        Returns:
+            Both ``[B, M, 3]`` m.
+        """
         stated = paths.centre - self.sensor[spots][:, None]
         x, y = self.value("baseline_x"), self.value("baseline_y")
         return stated, stated - torch.stack([x, y, torch.zeros_like(x)])

@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 EDGE = 0.12  # width of the soft edge, in radii
@@ -31,8 +33,16 @@ class Occlusion(Effect):
     """
 
     name = "occlusion"
-    stage = "path"
-    needs_paths = True
+    words = EffectWords(
+        phrase="something opaque between the wall and the scene",
+        cause="An object that returns no light itself shadows part of the scene for part of the wall.",
+        remedy="Look for a dark object at the place given and remove it, or scan a wider part of the wall "
+        "to see around it.",
+        headline="{opacity} of the light, at depth {z}, radius {radius}",
+    )
+
+    laser: Tensor
+    sensor: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
@@ -45,19 +55,28 @@ class Occlusion(Effect):
         first, last = (scan.t_start + k * scan.bin_length for k in scan.gate)
         nearest, farthest = max(first, last / 8) / 2, last / 2
         half = scan.half
-        across = (-0.5 * half, 0.0, 0.5 * half)
+        steps = (-0.5 * half, 0.0, 0.5 * half)
         radius = 0.3 * half
+
+        def across(name: str, middle: float) -> Parameter:
+            low, high = middle - 2 * half, middle + 2 * half
+            grid = tuple(middle + a for a in steps)
+            return Parameter(name, "m", None, 0.1 * half, low, high, grid=grid, kind="length")
+
+        def beyond(name: str, low: float, high: float, start: float) -> Parameter:
+            return Parameter(name, "m", None, 0.2, low, high, grid=(start,), log=True, kind="length")
+
         return (
-            Parameter("opacity", "1", 0.0, 0.2, 0.0, 1.0),
-            Parameter(
-                "x", "m", None, 0.1 * half, x - 2 * half, x + 2 * half, grid=tuple(x + a for a in across)
-            ),
-            Parameter(
-                "y", "m", None, 0.1 * half, y - 2 * half, y + 2 * half, grid=tuple(y + a for a in across)
-            ),
-            Parameter("z", "m", None, 0.2, nearest / 10, farthest, grid=(nearest / 2,), log=True),
-            Parameter("radius", "m", None, 0.2, radius / 20, 2 * half, grid=(radius,), log=True),
+            Parameter("opacity", "1", 0.0, 0.2, 0.0, 1.0, kind="percent"),
+            across("x", x),
+            across("y", y),
+            beyond("z", nearest / 10, farthest, nearest / 2),
+            beyond("radius", radius / 20, 2 * half, radius),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"opacity": 1.0}
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         laser = self.transmission(self.laser[spots], paths.centre)
@@ -65,7 +84,15 @@ class Occlusion(Effect):
         return contribution * (laser * sensor)[..., None]
 
     def transmission(self, wall: Tensor, centre: Tensor) -> Tensor:
-        """``[B, M]`` of the lines from ``wall`` ``[B, 3]`` to ``centre`` ``[M, 3]``."""
+        """Light that lines from the wall to the surfels keep.
+
+        Args:
+            wall: ``[B, 3]`` m, points of it.
+            centre: ``[M, 3]`` m, of the surfels.
+
+        Returns:
+            ``[B, M]``, 1 where nothing is in the way.
+        """
         z, radius = self.value("z"), self.value("radius")
         away = centre - wall[:, None]
         crossing = (

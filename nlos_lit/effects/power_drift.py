@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Parameter
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.effects.words import EffectWords
 
 
 class PowerDrift(SmoothEffect):
@@ -30,7 +31,17 @@ class PowerDrift(SmoothEffect):
     """
 
     name = "power_drift"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a laser power that drifts during the scan",
+        cause="Laser output or detector efficiency changes with temperature while the scan runs.",
+        remedy="Warm up the laser, record a power monitor, or divide each spot by its direct pulse.",
+        headline="{peak_to_peak} from end to end of its range",
+    )
+    split_by: ClassVar = {
+        "wall_reflectance": "a second scan in another order",
+        "vignetting": "a second scan in another order",
+    }
+    witness = "energy"
     coefficients = "drift"
     ends: ClassVar[bool] = True
 
@@ -40,7 +51,11 @@ class PowerDrift(SmoothEffect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return cls.coefficient(scan, "1", 0.05, 1.5, 0.5)
+        return cls.coefficient(scan, "1", 0.05, 1.5, 0.5, kind="percent")
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"rms": 0.2}
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         return signal * torch.exp(self.field(spots))[:, None]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
 class Retroreflection(Effect):
-    """Brightness falls more slowly with distance, and depends less on the surface's tilt, than that of
-    diffuse surfaces.
+    """Brightness falls more slowly with distance, and depends less on the tilt, than from diffuse surfaces.
 
     ``d1⁻² d2⁻² cosθ2 cosθ3 → (d1 d2)^{-falloff/2} d0^{falloff-4} (cosθ2 cosθ3)^cosine``, d0 half the path at
     the middle of the gate.
@@ -26,17 +29,29 @@ class Retroreflection(Effect):
     spot), ``specular_lobe``.
 
     Source: M. O'Toole, D. B. Lindell, G. Wetzstein, *Confocal non-line-of-sight imaging based on the
-    light-cone transform*, Nature
-    555, 2018: r⁻⁴ for diffuse, r⁻² for retroreflective scenes.
+    light-cone transform*, Nature 555, 2018: r⁻⁴ for diffuse, r⁻² for retroreflective scenes.
     """
 
     name = "retroreflection"
-    stage = "path"
-    needs_paths = True
+    words = EffectWords(
+        phrase="a retroreflecting hidden surface",
+        cause="The surface sends light back to where it came from (tape, signs, safety vests): brightness "
+        "falls more slowly with distance and hardly with the angle.",
+        remedy="Cover the retroreflective parts, or keep the fitted exponents; a non-confocal scan is far "
+        "less sensitive to it.",
+        headline="falloff exponent {falloff} instead of 4, cosine exponent {cosine} instead of 1",
+    )
+    split_by: ClassVar = {
+        "wall_reflectance": "the direct pulse's energy over the wall, or a non-confocal scan",
+    }
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         return (Parameter("falloff", "1", 4.0, 0.2, 1.5, 4.2), Parameter("cosine", "1", 1.0, 0.2, -0.2, 1.2))
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"falloff": 2.0, "cosine": 0.0}
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         distance = paths.laser_leg * paths.sensor_leg / (self.scan.middle / 2) ** 2

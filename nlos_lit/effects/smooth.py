@@ -1,14 +1,18 @@
-"""What effects that are a smooth function of the spot share."""
+"""What effects share that are a smooth function of the spot."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis
 
 
@@ -35,17 +39,31 @@ class SmoothEffect(Effect):
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
-        """``[S, K]`` functions, and ``[K]`` how large their coefficients are likely to be against the first."""
+        """``[S, K]`` functions, and ``[K]`` how large their coefficients likely are against the first."""
         raise NotImplementedError
 
     @classmethod
     def coefficient(
-        cls, scan: Scan, unit: str, scale: float, bound: float, likely: float
+        cls, scan: Scan, unit: str, scale: float, bound: float, likely: float, kind: str = ""
     ) -> tuple[Parameter]:
-        """The declaration: null 0, bounds ± ``bound``, ``likely`` deviation of the first coefficient."""
+        """The declaration of the coefficients, null 0.
+
+        Args:
+            scan: of the capture.
+            unit, scale, kind: as of :class:`~nlos_lit.effects.parameter.Parameter`.
+            bound: none is larger, either way.
+            likely: deviation of the first coefficient.
+
+        Returns:
+            The one parameter.
+        """
         share = cls.basis(scan)[1]
         prior = tuple((likely * share**1.5).tolist())
-        return (Parameter(cls.coefficients, unit, 0.0, scale, -bound, bound, size=len(share), prior=prior),)
+        return (
+            Parameter(
+                cls.coefficients, unit, 0.0, scale, -bound, bound, size=len(share), prior=prior, kind=kind
+            ),
+        )
 
     def field(self, spots: Tensor | None = None) -> Tensor:
         """``[B]`` f at ``spots`` ``[B]``, or ``[S]`` at all of them."""
@@ -53,13 +71,25 @@ class SmoothEffect(Effect):
         return functions @ self.value(self.coefficients).reshape(-1)
 
     def quantities(self) -> dict[str, Quantity]:
-        unit, field = self.declared[self.coefficients].unit, self.field()
-        reported = {
-            "rms": Quantity(length(field / len(field) ** 0.5, self.declared[self.coefficients].scale), unit)
-        }
+        p, field = self.declared[self.coefficients], self.field()
+        reported = {"rms": Quantity(length(field / len(field) ** 0.5, p.scale), p.unit, kind=p.kind)}
         if self.ends:
-            reported["peak_to_peak"] = Quantity(field.amax() - field.amin(), unit)
+            reported["peak_to_peak"] = Quantity(field.amax() - field.amin(), p.unit, kind=p.kind)
         return reported
+
+    def settable(self) -> dict[str, str]:
+        return {"rms": self.declared[self.coefficients].unit}
+
+    def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
+        """A random function of the effect's own basis, of exactly the root mean square given."""
+        field = rng.standard_normal(self.functions.shape[1])
+        size = float((self.functions.double() @ torch.from_numpy(field)).square().mean().sqrt())
+        if size == 0:
+            raise UserError(
+                f"{self.name} needs more spots: the scan is too small for a smooth function over it"
+            )
+        drawn = torch.from_numpy(field * (self.given_size(values, "rms") / size))
+        self.set_given(self.coefficients, drawn, "rms")
 
 
 def over_time(scan: Scan) -> tuple[Tensor, Tensor]:
@@ -68,14 +98,32 @@ def over_time(scan: Scan) -> tuple[Tensor, Tensor]:
 
 
 def over_wall(scan: Scan, n: int) -> tuple[Tensor, Tensor]:
-    """``[S, ≤ n² - 1]`` smooth functions of the wall point, of both added where laser and sensor move; and
-    their shares.
+    """Smooth functions of the wall point, of both added where laser and sensor move.
+
+    Args:
+        scan: of the capture.
+        n: splines along either side of the wall.
+
+    Returns:
+        ``[S, K ≤ n² - 1]`` functions, and their shares ``[K]``.
     """
     functions, share = smooth_map_basis(torch.cat(scan.places), n)
     return functions.view(len(scan.places), scan.n_spots, -1).sum(0), share
 
 
 def length(values: Tensor, scale: float) -> Tensor:
-    """Euclidean length of ``values``, with gradient zero instead of none at zero: exact to 1e-4 of ``scale``."""
+    """Euclidean length, with gradient zero instead of none at zero.
+
+    Args:
+        values: of any shape.
+        scale: of noticeable values; the length is exact to 1e-4 of it.
+
+    Returns:
+        A scalar.
+
+    Examples:
+        >>> round(float(length(torch.tensor([3.0, 4.0]), 1.0)), 3)
+        5.0
+    """
     least = 1e-4 * scale
     return torch.sqrt(values.square().sum() + least**2) - least

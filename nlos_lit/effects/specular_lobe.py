@@ -6,7 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -27,8 +29,15 @@ class SpecularLobe(Effect):
     """
 
     name = "specular_lobe"
-    stage = "path"
-    needs_paths = True
+    words = EffectWords(
+        phrase="a glossy hidden surface",
+        cause="Part of the light is reflected around the mirror direction, so spots that face the surface "
+        "see it too bright.",
+        remedy="Make the surface matt where you can; a non-confocal scan shows the lobe's direction.",
+        headline="lobe strength {strength}",
+    )
+
+    apart: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
@@ -40,6 +49,10 @@ class SpecularLobe(Effect):
             Parameter("strength", "1", 0.0, 0.1, 0.0, 5.0),
             Parameter("exponent", "1", None, 0.5, 1.0, 300.0, grid=(4.0, 16.0, 64.0), log=True),
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"strength": 0.5}
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         one, two = paths.laser_leg, paths.sensor_leg

@@ -8,8 +8,10 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.smooth import length
+from nlos_lit.effects.words import EffectWords
 
 MOST_PERIODS = 200
 
@@ -33,7 +35,13 @@ class TcspcNonlinearity(Effect):
     """
 
     name = "tcspc_nonlinearity"
-    stage = "counting"
+    words = EffectWords(
+        phrase="time bins of unequal width",
+        cause="The timing electronics' bins are not equally wide; the pattern repeats with the "
+        "interpolator's period.",
+        remedy="Record a flat histogram with steady light and divide by it.",
+        headline="{amplitude} with a period of {period}",
+    )
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
@@ -42,8 +50,14 @@ class TcspcNonlinearity(Effect):
         low = min(max(1 / 40, 2 / width), high / 2)
         n = min(MOST_PERIODS, math.ceil((high - low) * 1.5 * width) + 1)
         periods = tuple(1 / (low + (high - low) * k / (n - 1)) for k in range(n))
-        waves = tuple(Parameter(name, "1", 0.0, 0.02, -0.7, 0.7) for name in ("sine", "cosine"))
+        waves = tuple(
+            Parameter(name, "1", 0.0, 0.02, -0.7, 0.7, kind="percent") for name in ("sine", "cosine")
+        )
         return (*waves, Parameter("period", "bins", None, 0.01, 2.0, 50.0, grid=periods, log=True))
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"sine": 0.05, "cosine": 0.0}
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
@@ -55,6 +69,6 @@ class TcspcNonlinearity(Effect):
     def quantities(self) -> dict[str, Quantity]:
         waves = torch.stack([self.value("sine"), self.value("cosine")])
         return {
-            "amplitude": Quantity(length(waves, 0.02), "1"),
+            "amplitude": Quantity(length(waves, 0.02), "1", kind="percent"),
             "period": Quantity(self.value("period"), "bins"),
         }

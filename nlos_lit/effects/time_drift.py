@@ -7,8 +7,9 @@ from typing import ClassVar
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Parameter
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -29,8 +30,16 @@ class TimeDrift(SmoothEffect):
     """
 
     name = "time_drift"
-    stage = "time"
-    needs_paths = True
+    words = EffectWords(
+        phrase="a time zero that drifts during the scan",
+        cause="Laser trigger and timing electronics wander as they warm up.",
+        remedy="Let the rig warm up, scan faster, or align every spot to its own direct pulse.",
+        headline="{peak_to_peak} from end to end of its range",
+    )
+    split_by: ClassVar = {
+        "wall_tilt": "a second scan in another order (serpentine or column by column)",
+        "time_offset": "a second scan in another order",
+    }
     coefficients = "drift"
     ends: ClassVar[bool] = True
 
@@ -43,6 +52,10 @@ class TimeDrift(SmoothEffect):
         return cls.coefficient(
             scan, "m", scan.bin_length, 0.1 * scan.n_bins * scan.bin_length, 4 * scan.bin_length
         )
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"rms": 1.5 * scan.bin_length}
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.field(spots)[:, None, None]

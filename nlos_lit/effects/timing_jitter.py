@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
+import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter, Quantity
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.smooth import length as euclidean
+from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
 
@@ -27,14 +33,33 @@ class TimingJitter(Effect):
     """
 
     name = "timing_jitter"
-    stage = "time"
-    needs_paths = True
+    words = EffectWords(
+        phrase="a time zero that jumps from spot to spot",
+        cause="Each spot's histogram starts at a slightly different time: trigger, scanner settling, or "
+        "per-spot alignment.",
+        remedy="Check the synchronisation between scanner and timing electronics; align every spot to its "
+        "own direct pulse.",
+        headline="σ = {sigma}",
+    )
     per_spot = True
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         reach = 0.1 * scan.n_bins * scan.bin_length
         return (Parameter("offset", "m", 0.0, scan.bin_length, -reach, reach, size=scan.n_spots),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"sigma": scan.bin_length}
+
+    def settable(self) -> dict[str, str]:
+        return {"sigma": "m"}
+
+    def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
+        """Normal deviates of the width given, one for each spot."""
+        sigma = self.given_size(values, "sigma")
+        drawn = torch.from_numpy(sigma * rng.standard_normal(self.scan.n_spots))
+        self.set_given("offset", drawn, "sigma")
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.value("offset").reshape(-1)[spots][:, None, None]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Effect, Parameter
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.words import EffectWords
 
 
 class Vignetting(Effect):
@@ -26,15 +30,32 @@ class Vignetting(Effect):
     """
 
     name = "vignetting"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a brightness that changes from the middle of the scan to its edge",
+        cause="Lens, mirrors or an aperture pass less light at the edge of the field.",
+        remedy="Open the aperture, re-centre the optics, or measure a flat field.",
+        headline="{strength} darker at the edge (log gain)",
+    )
+    split_by: ClassVar = {
+        "wall_reflectance": "a capture with the optics shifted against the wall",
+        "retroreflection": "a target of known reflectance, or a non-confocal scan",
+    }
+    witness = "energy"
+
+    square: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
-        self.register_buffer("square", sum(place.square().sum(1) for place in scan.places), persistent=False)
+        squares = [place.square().sum(1) for place in scan.places]
+        self.register_buffer("square", sum(squares[1:], squares[0]), persistent=False)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("strength", "1", 0.0, 0.05, -2.0, 2.0),)
+        return (Parameter("strength", "1", 0.0, 0.05, -2.0, 2.0, kind="percent"),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"strength": 0.4}
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         return signal * torch.exp(-self.value("strength") * self.square[spots])[:, None]

@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects.effect import Parameter
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_wall
+from nlos_lit.effects.words import EffectWords
 
 
 class WallReflectance(SmoothEffect):
@@ -28,7 +29,13 @@ class WallReflectance(SmoothEffect):
     """
 
     name = "wall_reflectance"
-    stage = "spot"
+    words = EffectWords(
+        phrase="a relay wall that is brighter in some places than in others",
+        cause="Paint, stains or texture change how much light each wall point passes on.",
+        remedy="Repaint the wall, or measure its gain with the direct pulse and divide by it.",
+        headline="{rms} rms over the wall",
+    )
+    witness = "energy"
     coefficients = "gain_map"
 
     @classmethod
@@ -37,7 +44,11 @@ class WallReflectance(SmoothEffect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return cls.coefficient(scan, "1", 0.05, 1.0, 0.5)
+        return cls.coefficient(scan, "1", 0.05, 1.0, 0.5, kind="percent")
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"rms": 0.2}
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         return signal * torch.exp(self.field(spots))[:, None]

@@ -12,6 +12,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn, tested_rows, tested_spots
 from nlos_lit.inference.discrepancy import Discrepancy
@@ -27,30 +28,6 @@ from nlos_lit.inference.witness import witness
 from nlos_lit.surfels.fit import SurfelFit
 
 SEEN = 25.0  # statistic from which on an effect counts as detectable
-SPLIT_BY = {
-    frozenset(
-        {"irf_tail", "afterpulsing"}
-    ): "a dark or ambient-only record: afterpulses follow background counts, a slow tail does not",
-    frozenset({"time_drift", "wall_tilt"}): "a second scan in another order (serpentine or column by column)",
-    frozenset({"time_drift", "time_offset"}): "a second scan in another order",
-    frozenset({"power_drift", "wall_reflectance"}): "a second scan in another order",
-    frozenset({"power_drift", "vignetting"}): "a second scan in another order",
-    frozenset({"vignetting", "wall_reflectance"}): "a capture with the optics shifted against the wall",
-    frozenset({"vignetting", "retroreflection"}): "a target of known reflectance, or a non-confocal scan",
-    frozenset(
-        {"retroreflection", "wall_reflectance"}
-    ): "the direct pulse's energy over the wall, or a non-confocal scan",
-    frozenset({"pile_up", "wall_reflectance"}): "a capture at a tenth of the laser power",
-    frozenset(
-        {"ghost_pulse", "higher_order_bounces"}
-    ): "a capture of a single flat target, where no light bounces twice",
-    frozenset(
-        {"irf_tail", "higher_order_bounces"}
-    ): "a capture of a single flat target, where no light bounces twice",
-    frozenset({"ambient_map", "hot_spots"}): "a capture with the laser off",
-    frozenset({"background_slope", "afterpulsing"}): "a capture with the laser off",
-    frozenset({"direct_leak", "gate_edges"}): "a capture with the gate opened later",
-}
 
 
 @dataclass(frozen=True)
@@ -90,7 +67,8 @@ def assemble(
         p, feigned = weighed(turn.accepted.candidate, null, settings.level)
         if feigned:
             notes.append(
-                f"{turn.accepted.name} improved the fit, but captures simulated without it score as much (p = {p:.2g})"
+                f"{turn.accepted.name} improved the fit,"
+                f" but captures simulated without it score as much (p = {p:.2g})"
             )
             continue
         effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
@@ -213,9 +191,7 @@ def _accepted(
         p_value=p,
         heldout_gain=_gain(trial, split),
         confusable_with=group,
-        split_by="; ".join(
-            sorted({SPLIT_BY.get(frozenset({effect.name, other}), "") for other in group} - {""})
-        ),
+        split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in group} - {""})),
     )
 
 

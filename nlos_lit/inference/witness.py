@@ -11,19 +11,22 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
+from nlos_lit.effects import EFFECTS
 from nlos_lit.surfels.fit import SurfelFit
 
 LEAST = 20.0  # counts a spot before the gate that make a witness
-GAINS = ("wall_reflectance", "power_drift", "vignetting")
-SLOW = (
-    "irf_tail",
-    "afterpulsing",
-)  # both follow the direct pulse, too, with the decay that they have inside the gate
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
-    """Correlation of the fitted gain with the direct pulse's energy per spot, and both tails' decays; None
-    without the pulse.
+    """What the direct pulse says of the effects that have it as witness.
+
+    Args:
+        capture: with bins before its gate.
+        fit: to the gate alone.
+
+    Returns:
+        Correlation of the fitted gain with the pulse's energy per spot, both tails' decays (m of path) and
+        the maps; None without the pulse.
     """
     first = capture.gate[0]
     before = capture.counts[:, :first].sum(1, dtype=np.float64)
@@ -36,24 +39,32 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         "tail_decay_direct_m": None,
         "maps": None,
     }
-    effects = {e.name: e for e in fit.extension.effects}
     gain = log_gain(fit, capture.n_spots)
     if gain is not None:
         found["wall_gain_correlation"] = float(np.corrcoef(gain, np.log(before.clip(1)))[0, 1])
         if capture.scan_shape is not None and len(capture.scan_shape) == 2:
             maps = {"direct": before / before.mean(), "fitted": np.exp(gain)}
             found["maps"] = {name: m.reshape(capture.scan_shape).tolist() for name, m in maps.items()}
-    slow = next((effects[name] for name in SLOW if name in effects), None)
-    if slow is not None:
-        found["tail_decay_fitted_m"] = float(slow.value("decay").detach())
+    slow = [e for e in fit.extension.effects if e.witness == "tail"]
+    if slow:
+        first_acting = min(slow, key=lambda e: EFFECTS.index(type(e)))
+        found["tail_decay_fitted_m"] = float(first_acting.value("decay").detach())
         found["tail_decay_direct_m"] = direct_decays(capture)
     return found
 
 
 @torch.no_grad()
 def log_gain(fit: SurfelFit, n_spots: int) -> np.ndarray | None:
-    """``[S]`` log of all fitted gains together; None where no effect changes the gain."""
-    acting = [e for e in fit.extension.effects if e.name in GAINS]
+    """Log of all fitted gains together that the direct pulse's energy must show, too.
+
+    Args:
+        fit: with effects.
+        n_spots: of the capture.
+
+    Returns:
+        ``[S]``; None where no effect changes the gain.
+    """
+    acting = [e for e in fit.extension.effects if e.witness == "energy"]
     if not acting:
         return None
     spots, signal = torch.arange(n_spots), torch.ones(n_spots, 1)
@@ -63,8 +74,7 @@ def log_gain(fit: SurfelFit, n_spots: int) -> np.ndarray | None:
 
 
 def direct_decays(capture: Capture) -> list[float] | None:
-    """Decay lengths (m) of the mean direct pulse, early and late: fits of an exponential to two stretches
-    behind its peak.
+    """Decay lengths (m) of the mean direct pulse, early and late, of exponentials fitted behind its peak.
 
     The level before the gate's start is taken as background. Early is from 1/20 to 1/200 of the peak, late
     the rest down to three times the background.

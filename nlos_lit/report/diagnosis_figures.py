@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from nlos_lit.inference.result import Accepted, Diagnosis, Profile, Screened
-from nlos_lit.report.quantities import number, percent, plus_minus, scales
+from nlos_lit.report.quantities import number, percent, plus_minus, scales, scales_of
 from nlos_lit.report.style import (
     BLACK,
     BLUE,
@@ -154,7 +154,8 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
             linewidth=0.6,
         )
         axes.plot([max(one.expected, 1)] * 2, (row - 0.36, row + 0.36), color=BLACK, linewidth=1.6)
-        text = f"{number(one.statistic)}   keeps {percent(one.retained_information)}, gain {number(one.predicted_gain)} nats"
+        kept, gain = percent(one.retained_information), number(one.predicted_gain)
+        text = f"{number(one.statistic)}   keeps {kept}, gain {gain} nats"
         place = max(length, one.expected) * largest**0.015
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
         axes.text(place, row, text, va="center", fontsize="small", color=GREY if hard else BLACK, bbox=box)
@@ -167,7 +168,8 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
     axes.set_xticks([10.0**k for k in range(int(np.log10(largest)) + 1)])
     axes.minorticks_off()
     axes.set_title(
-        "black tick: expected without the effect; dashed: counts as visible;\nhatched: barely identifiable here",
+        "black tick: expected without the effect; dashed: counts as visible;\n"
+        "hatched: barely identifiable here",
         loc="left",
     )
     return figure
@@ -373,7 +375,7 @@ def witness_maps(
 @styled
 def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
     """Decay of the fitted tail against the direct pulse's, early to late; all m of path."""
-    factor, unit = scales("irf_tail", "decay", "m", fitted, None)[0]
+    factor, unit = scales_of("time", "m", fitted, None)[0]
     figure = Figure(figsize=(6, 1.7))
     axes = figure.subplots()
     low, high = sorted(factor * value for value in direct)
@@ -420,4 +422,5 @@ def _beyond(values: np.ndarray) -> str:
     if not known.size:
         return "no values"
     count, chance = int((np.abs(known) > 3).sum()), number(BY_CHANCE * known.size, 2)
-    return f"{count} of {known.size} beyond 3σ (chance: {chance}), largest {number(known[np.abs(known).argmax()], 2)} σ"
+    largest = number(known[np.abs(known).argmax()], 2)
+    return f"{count} of {known.size} beyond 3σ (chance: {chance}), largest {largest} σ"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from nlos_lit.capture import SPEED_OF_LIGHT
 from nlos_lit.inference.result import Estimate
-from nlos_lit.report.words import SHAPES, describe
+from nlos_lit.report.words import describe
 
 KINDS_OF_UNIT = {
     "m": ("time", "length"),
@@ -29,7 +29,19 @@ NONE = "–"
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """A number with ``digits`` significant digits; – for none, NaN and infinities."""
+    """A number as text.
+
+    Args:
+        value: to be said.
+        digits: significant ones.
+
+    Returns:
+        – for None, NaN and infinities.
+
+    Examples:
+        >>> number(1234.5), number(0.00012345, 2), number(1.5e-7, 2), number(None)
+        ('1234', '0.00012', '1.5 × 10⁻⁷', '–')
+    """
     if value is None or not math.isfinite(value):
         return NONE
     if value == 0:
@@ -41,7 +53,19 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def percent(share: float | None, digits: int = 2) -> str:
-    """A share in percent."""
+    """A share in percent.
+
+    Args:
+        share: 1 is all.
+        digits: significant ones.
+
+    Returns:
+        – for None, NaN and infinities.
+
+    Examples:
+        >>> percent(0.0723)
+        '7.2 %'
+    """
     return NONE if share is None or not math.isfinite(share) else f"{number(100 * share, digits)} %"
 
 
@@ -51,7 +75,16 @@ def probability(p: float | None) -> str:
 
 
 def plus_minus(value: float, stderr: float) -> str:
-    """``value ± stderr``, rounded where the error is: one digit of it, two when it begins with 1."""
+    """``value ± stderr``, rounded where the error is: one digit of it, two when it begins with 1.
+
+    Args:
+        value: estimate.
+        stderr: its standard error, in the same unit; ``?`` where it is not a positive number.
+
+    Examples:
+        >>> plus_minus(0.2113, 0.021), plus_minus(5.4321, 0.0123)
+        ('0.21 ± 0.02', '5.432 ± 0.012')
+    """
     if not (math.isfinite(value) and math.isfinite(stderr) and stderr > 0):
         return f"{number(value)} ± ?"
     decimals = _decimals(stderr)
@@ -63,14 +96,40 @@ def plus_minus(value: float, stderr: float) -> str:
 def scales(
     effect: str, parameter: str, unit: str | None, size: float, bin_length: float | None
 ) -> list[tuple[float, str]]:
-    """How to say a parameter: (factor, unit) pairs, the most telling first.
+    """How to say a number of an effect.
 
     Args:
+        effect, parameter: their names.
         unit: the unit it is given in; None for the effect's own.
         size: its magnitude, which chooses between ps and ns, mm and m.
         bin_length: m, where known.
+
+    Returns:
+        (factor, unit) pairs, the most telling first.
+
+    Examples:
+        >>> scales("occlusion", "radius", "m", 0.25, None)
+        [(1000.0, 'mm')]
     """
-    kind = describe(effect).kind_of(parameter)
+    return scales_of(describe(effect).kind_of(parameter), unit, size, bin_length)
+
+
+def scales_of(kind: str, unit: str | None, size: float, bin_length: float | None) -> list[tuple[float, str]]:
+    """How to say a number of a kind.
+
+    Args:
+        kind: ``percent``, ``plain``, ``time``, ``length``, ``angle``, ``bins`` or ``counts``.
+        unit: the unit it is given in, which may speak against the kind; None for the kind's own.
+        size: its magnitude, which chooses between ps and ns, mm and m.
+        bin_length: m, where known.
+
+    Returns:
+        (factor, unit) pairs, the most telling first.
+
+    Examples:
+        >>> [f"{factor:.4g} {unit}" for factor, unit in scales_of("time", None, 0.01, 0.005)]
+        ['3336 ps', '1000 mm of path', '200 bins']
+    """
     unit = UNIT_OF_KIND[kind] if unit is None else unit
     allowed = KINDS_OF_UNIT.get(unit, ("counts",))  # any other unit is said as it is
     kind = kind if kind in allowed else allowed[0]
@@ -92,32 +151,82 @@ def scales(
 
 
 def quantity(effect: str, parameter: str, estimate: Estimate, bin_length: float | None) -> list[str]:
-    """``21 ± 2 %``; for times ``0.39 ± 0.02 ns``, ``117 ± 6 mm of path``, ``24.4 ± 1.2 bins``."""
+    """An estimate with its error, in every unit that people think in.
+
+    Args:
+        effect, parameter: their names.
+        estimate: value and standard error, in a unit of its own.
+        bin_length: m, where known.
+
+    Returns:
+        The most telling first.
+
+    Examples:
+        >>> quantity("irf_tail", "fraction", Estimate(0.21, 0.02, "1"), None)
+        ['21 ± 2 %']
+        >>> quantity("irf_tail", "decay", Estimate(0.117, 0.006, "m"), 0.0048)
+        ['0.39 ± 0.02 ns', '117 ± 6 mm of path', '24.4 ± 1.2 bins']
+    """
     ways = scales(effect, parameter, estimate.unit, estimate.value, bin_length)
     return [f"{plus_minus(f * estimate.value, f * estimate.stderr)} {unit}".strip() for f, unit in ways]
 
 
 def amount(effect: str, parameter: str, value: float | None, bin_length: float | None) -> str:
-    """A bare value of a parameter in its most telling unit."""
+    """A bare value of a parameter in its most telling unit.
+
+    Args:
+        effect, parameter: their names.
+        value: in the effect's own unit.
+        bin_length: m, where known.
+
+    Returns:
+        – for None, NaN and infinities.
+
+    Examples:
+        >>> amount("wall_tilt", "tilt_x", 0.04, None)
+        '40.0 mrad'
+    """
+    return amount_of(describe(effect).kind_of(parameter), value, bin_length)
+
+
+def amount_of(kind: str, value: float | None, bin_length: float | None = None) -> str:
+    """A bare value of a kind in its most telling unit.
+
+    Args:
+        kind: as of :func:`scales_of`.
+        value: in the kind's own unit.
+        bin_length: m, where known.
+
+    Returns:
+        – for None, NaN and infinities.
+    """
     if value is None or not math.isfinite(value):
         return NONE
-    factor, unit = scales(effect, parameter, None, value, bin_length)[0]
+    factor, unit = scales_of(kind, None, value, bin_length)[0]
     return f"{number(factor * value)} {unit}".strip()
 
 
 def headline(effect: str, parameters: Mapping[str, Estimate]) -> str:
-    """Size of an effect in a few words, shapes without their errors; parameter by parameter where its
-    sentence does not fit.
+    """Size of an effect in a few words, shapes without their errors.
+
+    Args:
+        effect: its name.
+        parameters: by name; parameter by parameter where the effect's sentence does not fit them.
+
+    Examples:
+        >>> headline("irf_tail", {"fraction": Estimate(0.2, 0.02, "1"), "decay": Estimate(0.117, 0.006, "m")})
+        '20 ± 2 % of the photons, τ = 0.39 ns'
     """
+    known = describe(effect)
 
     def short(name: str, estimate: Estimate) -> str:
         factor, unit = scales(effect, name, estimate.unit, estimate.value, None)[0]
         both = plus_minus(factor * estimate.value, factor * estimate.stderr)
-        return f"{both.split(' ± ')[0] if name in SHAPES else both} {unit}".strip()
+        return f"{both.split(' ± ')[0] if known.null_of(name) is None else both} {unit}".strip()
 
     values = {name: short(name, estimate) for name, estimate in parameters.items()}
     try:
-        text = describe(effect).headline.format(**values)
+        text = known.words.headline.format(**values)
     except KeyError:
         text = ""
     return text or ", ".join(f"{name.replace('_', ' ')} {value}" for name, value in values.items())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from nlos_lit.inference.result import Accepted, Diagnosis, Scores, Screened
 from nlos_lit.report.quantities import headline, percent, probability
-from nlos_lit.report.words import AXES, BOUNDED, describe
+from nlos_lit.report.words import AXES, describe
 
 AT_NOISE = 0.03  # excess over counting noise that is called "at the noise"
 BARELY = 0.05  # retained information below which the scene can imitate nearly all of an effect
@@ -15,11 +15,15 @@ BARELY = 0.05  # retained information below which the scene can imitate nearly a
 
 @dataclass(frozen=True)
 class Misfit:
-    """Deviance per bin of the base, taken apart: what counting noise makes, what the extension explains, what
-    is left.
+    """Deviance per bin of the base, taken apart.
 
-    ``share`` is the explained part of the excess over noise, negative where the extension is worse; None
-    without an excess.
+    Args:
+        noise: what counting noise makes.
+        explained: what the extension explains.
+        unexplained: what is left.
+        share: the explained part of the excess over noise, negative where the extension is worse; None
+            without an excess.
+        untouched: scored on spots that nothing was fitted to or chosen with.
     """
 
     noise: float
@@ -30,8 +34,9 @@ class Misfit:
 
 
 def misfit(diagnosis: Diagnosis) -> Misfit:
-    """On the untouched spots where they were scored, else on the held-out ones; each fit against its own
-    noise level.
+    """The misfit on the untouched spots where they were scored, else on the held-out ones.
+
+    Each fit stands against its own noise level.
     """
     base, extended, untouched = _scored(diagnosis)
     before, after = _excess(base), _excess(extended)
@@ -41,8 +46,16 @@ def misfit(diagnosis: Diagnosis) -> Misfit:
     return Misfit(base.deviance_noise, before - left, left, 1 - after / before, untouched)
 
 
-def rivals(diagnosis: Diagnosis, name: str) -> list[str]:
-    """Effects that share a group with ``name``: this capture cannot tell them apart."""
+def indistinguishable(diagnosis: Diagnosis, name: str) -> list[str]:
+    """Effects that this capture cannot tell apart from one.
+
+    Args:
+        diagnosis: with groups of such effects.
+        name: of the one.
+
+    Returns:
+        Names, each once, in the order of the groups.
+    """
     return list(
         dict.fromkeys(
             other for group in diagnosis.groups if name in group for other in group if other != name
@@ -57,8 +70,8 @@ def barely(screened: Screened) -> bool:
 
 def invisible(screened: Screened) -> bool:
     """No physically possible strength would have shown."""
-    limits = screened.detectable.items()
-    return bool(limits) and all(not math.isfinite(v) or (n in BOUNDED and v > 1) for n, v in limits)
+    limits, known = screened.detectable.items(), describe(screened.name)
+    return bool(limits) and all(not math.isfinite(v) or (known.number(n).share and v > 1) for n, v in limits)
 
 
 def tone(diagnosis: Diagnosis) -> str:
@@ -69,9 +82,7 @@ def tone(diagnosis: Diagnosis) -> str:
 
 
 def missing(diagnosis: Diagnosis) -> list[str]:
-    """What the simulation misses, in plain words, one entry for each effect and each group without an
-    accepted one.
-    """
+    """What the simulation misses, in plain words: each effect, and each group without an accepted one."""
     names = {effect.name for effect in diagnosis.effects}
     found = [_one(diagnosis, effect) for effect in diagnosis.effects]
     for group in diagnosis.groups:
@@ -81,8 +92,11 @@ def missing(diagnosis: Diagnosis) -> list[str]:
 
 
 def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
-    """What is wrong, in plain words and one or two sentences; several things are only counted where they are
-    not ``listed``.
+    """What is wrong, in plain words and one or two sentences.
+
+    Args:
+        diagnosis: the whole.
+        listed: say each of several things; else they are only counted.
     """
     found = missing(diagnosis)
     axis = AXES.get(diagnosis.unexplained.axis, "on some axis")
@@ -134,7 +148,8 @@ def sureness(diagnosis: Diagnosis) -> str:
         hidden = sum(invisible(s) for s in diagnosis.screened)
         hard = sum(barely(s) and not invisible(s) for s in diagnosis.screened)
         parts.append(
-            f"Effects tested: {len(diagnosis.screened)}, of which {hard} barely identifiable in this capture, {hidden} not at all."
+            f"Effects tested: {len(diagnosis.screened)}, of which {hard} barely identifiable in this capture,"
+            f" {hidden} not at all."
         )
     if diagnosis.toys:
         parts.append(f"What noise alone does was checked on {diagnosis.toys} simulated captures.")
@@ -146,7 +161,7 @@ def sureness(diagnosis: Diagnosis) -> str:
 def _one(diagnosis: Diagnosis, effect: Accepted) -> str:
     size = headline(effect.name, effect.parameters)
     text = f"{describe(effect.name).phrase}: {size}" if size else describe(effect.name).phrase
-    others = rivals(diagnosis, effect.name)
+    others = indistinguishable(diagnosis, effect.name)
     return f"{text} (or {_either(others)}: this capture cannot tell which)" if others else text
 
 
@@ -160,13 +175,14 @@ def _nothing(diagnosis: Diagnosis) -> str:
     excess = _excess(base) / base.deviance_noise
     if not excess > AT_NOISE:
         return "Nothing in the registry is needed: the fit is at the noise."
-    return f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise, is not significant."
+    return (
+        f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise,"
+        " is not significant."
+    )
 
 
 def _scored(diagnosis: Diagnosis) -> tuple[Scores, Scores, bool]:
-    """Base and extension on the untouched spots (True) where both were scored there, else on the held-out
-    ones.
-    """
+    """Base and extension on the untouched spots (True) where both were scored there, else held-out ones."""
     test = diagnosis.untouched_test
     if {"base", "extended"} <= set(test):
         return test["base"], test["extended"], True

@@ -14,23 +14,21 @@ import logging
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-import psutil
 import torch
-from scipy.optimize import brentq
 from torch import Tensor
 
 from data_modules.simulate import Mesh, ScanPlan, SensorModel, Truth, simulate_capture
 from data_modules.simulate.sensor import draw_counts
 from data_modules.simulate.transients import BLOCK_PAIRS, Patches
 from nlos_lit.capture import Capture
-from nlos_lit.capture.errors import MemoryBudgetError, UserError
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.pile_up import PileUp
 from nlos_lit.effects.strengths import effects_at, report
 from nlos_lit.functional.surfel_paths import SPLINE_VARIANCE, quadrature, spread
 from nlos_lit.model.parameters import BoundedParameter
+from nlos_lit.runtime.memory import check_machine
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 log = logging.getLogger(__name__)
@@ -74,7 +72,8 @@ def measure(
         raise UserError("the direct pulse cannot be simulated with effects; set direct_counts to 0")
     if scan.gate is not None and scan.gate[1] != scan.n_bins:
         raise UserError(
-            f"with effects the record ends with the gate; found gate={list(scan.gate)}, so take n_bins={scan.gate[1]}"
+            f"with effects the record ends with the gate; found gate={list(scan.gate)},"
+            f" so take n_bins={scan.gate[1]}"
         )
     built = effects_at(effects, values, planned_scan(scan, sensor), seed, exposure)
     capture, truth = simulate_capture(
@@ -130,7 +129,8 @@ def truth_surfels(
     points, rows = np.unique(ends, axis=0, return_inverse=True)
     laser, point = rows.reshape(2, -1)
     patches = Patches(mesh, points[:, :3], capture.bin_length, detail)
-    _check_memory((3 * capture.n_spots + len(points)) * len(patches) * (1 + two_sided))
+    needed = (3 * capture.n_spots + len(points)) * len(patches) * (1 + two_sided)
+    check_machine(needed, "what each spot sees of the surfels", "use fewer spots or less detail")
     facing = np.empty((len(points), len(patches)), dtype=np.int8)
     size = max(1, BLOCK_PAIRS // len(patches))
     for start in range(0, len(points), size):
@@ -170,36 +170,9 @@ def expected_counts(model: SurfelModel, effects: list[Effect]) -> Tensor:
     counting = [effect for effect in effects if effect.stage == "counting"]
     expected = model.expected(spots, Extension([effect for effect in effects if effect.stage != "counting"]))
     for effect in counting:
-        if isinstance(effect, PileUp):
-            detections = float(effect.value("detections"))
-            effect.scan = dataclasses.replace(
-                effect.scan, mean_counts=detections * laser_cycles(expected.sum(1), detections)
-            )
+        effect.settle(expected)
         expected = effect.counting(expected, spots)
     return expected
-
-
-def laser_cycles(photons: Tensor, detections: float) -> float:
-    """N with ``mean_s (1 - e^{-M_s/N}) = detections``, for M photons a spot ``[S]``; infinite for no
-    detections.
-
-    Raises:
-        UserError: spots without photons are too many for that.
-    """
-    if detections == 0:
-        return float("inf")
-    photons = photons.double().numpy()
-    most = float((photons > 0).mean())
-    if detections >= most:
-        raise UserError(
-            f"pile_up.detections={detections:g} is more than any laser power gives: {1 - most:.0%} of the spots are dark"
-        )
-
-    def excess(log_cycles: float) -> float:
-        return float(-np.expm1(-photons / np.exp(log_cycles)).mean()) - detections
-
-    level = np.log(photons[photons > 0])
-    return float(np.exp(brentq(excess, level.min() - 10, level.max() + 40)))
 
 
 def _response(sensor: SensorModel, bin_length: float, intensity: float) -> dict[str, BoundedParameter]:
@@ -221,12 +194,3 @@ def _response(sensor: SensorModel, bin_length: float, intensity: float) -> dict[
         name: BoundedParameter(value, value / 1.01, value * 1.01, unit)
         for name, (value, unit) in start.items()
     }
-
-
-def _check_memory(needed: int) -> None:
-    free = psutil.virtual_memory().available
-    if needed > free:
-        raise MemoryBudgetError(
-            f"which of the surfels each spot sees takes {needed / 2**30:.1f} GiB but {free / 2**30:.1f} GiB are free;"
-            " use fewer spots or less detail"
-        )

@@ -16,8 +16,9 @@ from data_modules.simulate import Mesh, ScanPlan, SensorModel, join, simulate_ca
 from data_modules.simulate.scenes import plate
 from nlos_lit.capture.errors import UserError
 from nlos_lit.effects import EFFECTS, build_effects
-from nlos_lit.effects.strengths import effects_at, report, settable, typical
-from nlos_lit.surfels.measure import laser_cycles, measure, planned_scan
+from nlos_lit.effects.pile_up import laser_cycles
+from nlos_lit.effects.strengths import effects_at, report, typical
+from nlos_lit.surfels.measure import measure, planned_scan
 
 SENSOR = SensorModel(mean_counts=1500, background=0.2)
 PLAN = ScanPlan(nx=5, ny=4, width=0.9, height=0.7, n_bins=230)
@@ -101,7 +102,7 @@ def test_every_effect_has_a_strength_that_does_something(scan):
     usual = typical(scan)
     assert list(usual) == [effect.name for effect in EFFECTS]
     for effect in effects_at(usual, {}, scan):
-        assert set(usual[effect.name]) <= set(settable(effect))
+        assert set(usual[effect.name]) <= set(effect.settable())
         null = dict(build_effects([effect.name], scan)[0].named_parameters())
         assert any(not torch.equal(p, null[name]) for name, p in effect.named_parameters()), effect.name
 
