@@ -1,7 +1,7 @@
-"""Results on disk: volumes (HDF5), points (PLY), meshes (PLY) and JSON.
+"""Whole files, and JSON.
 
-Every writer fills a hidden file beside its target and renames it: an interrupt leaves the old file or none,
-never half a file.
+Every writer of results fills a hidden file beside its target and renames it: an interrupt leaves the old file
+or none, never half a file.
 """
 
 from __future__ import annotations
@@ -20,8 +20,22 @@ import numpy as np
 
 @contextlib.contextmanager
 def whole_file(path: Path | str) -> Iterator[Path]:
-    """Yields a path of the target's suffix to write to; it becomes ``path`` when the block ends well, else it
-    vanishes.
+    """Write a file that appears under its name when it is complete, and otherwise not at all.
+
+    Args:
+        path: the target; missing folders are made, an old file is replaced.
+
+    Yields:
+        A hidden path beside the target, with its suffix, to write to; it becomes ``path`` when the block ends
+        well and vanishes when it raises.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     with whole_file(f"{folder}/note.txt") as partial:
+        ...         _ = partial.write_text("all of it")
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['note.txt']
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -34,8 +48,14 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
 
 def write_json(path: Path | str, data: Any) -> None:
-    """Strict JSON, two spaces deep; dataclasses, arrays and NumPy numbers become plain values, NaN and
-    infinities become null.
+    """Write strict JSON, two spaces deep.
+
+    Args:
+        path: the target, written whole or not at all.
+        data: anything that :func:`plain` takes.
+
+    Raises:
+        TypeError: ``data`` holds something that has no plain form; nothing is written.
     """
     text = json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False)
     with whole_file(path) as partial:
@@ -43,7 +63,17 @@ def write_json(path: Path | str, data: Any) -> None:
 
 
 def plain(data: Any) -> Any:
-    """``data`` in JSON's own types; raises TypeError for anything that has no plain form."""
+    """``data`` in JSON's own types.
+
+    Dataclasses, arrays and NumPy numbers become plain values, paths strings, NaN and infinities None.
+
+    Raises:
+        TypeError: something has no plain form.
+
+    Examples:
+        >>> plain({"depth": np.array([0.5, np.nan]), 3: Path("run")})
+        {'depth': [0.5, None], '3': 'run'}
+    """
     if dataclasses.is_dataclass(data) and not isinstance(data, type):
         return plain({field.name: getattr(data, field.name) for field in dataclasses.fields(data)})
     if isinstance(data, dict):

@@ -1,5 +1,6 @@
-"""A triangle mesh through the reconstructed points: Poisson surface reconstruction (Kazhdan and Hoppe 2013)
-by Open3D.
+"""A triangle mesh through the reconstructed points: Poisson surface reconstruction by Open3D.
+
+Kazhdan and Hoppe, *Screened Poisson surface reconstruction*, ACM Trans. Graph. 32(3), 29 (2013).
 """
 
 from __future__ import annotations
@@ -22,7 +23,13 @@ MIN_POINTS = 50
 
 @dataclass(frozen=True)
 class MeshReport:
-    """What became of the mesh: sizes, or the sentence that says why there is none."""
+    """What became of the mesh.
+
+    Args:
+        vertices: how many there are.
+        triangles: how many there are.
+        reason: the sentence that says why there is no mesh; None where there is one.
+    """
 
     vertices: int = 0
     triangles: int = 0
@@ -32,8 +39,9 @@ class MeshReport:
 def poisson_mesh(
     points: Points, depth: int = 8, trim: float = 1.5
 ) -> tuple[open3d.geometry.TriangleMesh | None, MeshReport]:
-    """Poisson surface through oriented points, grey by albedo, without what the method invents where there
-    are no points.
+    """Poisson surface through oriented points, without what the method invents where there are none.
+
+    Vertices are grey by the albedo of the nearest point.
 
     Poisson surfaces are closed: behind an open surface they bulge away from the data. The lowest so many per
     cent of the sampling density do not single that out (the bulge held 6 to 26 % of the vertices in
@@ -79,12 +87,32 @@ def poisson_mesh(
 
 
 def write_mesh(path: Path | str, points: Points, depth: int = 8, trim: float = 1.5) -> MeshReport:
-    """Binary PLY of ``poisson_mesh``; where there is none nothing is written and the report says why."""
+    """Write the mesh of :func:`poisson_mesh` as binary PLY; where there is none nothing is written.
+
+    Args:
+        path: PLY file, written whole or not at all.
+        points: as for :func:`poisson_mesh`.
+        depth: as for :func:`poisson_mesh`.
+        trim: as for :func:`poisson_mesh`.
+
+    Returns:
+        Sizes, or why there is no mesh.
+
+    Raises:
+        OSError: Open3D could not write the file.
+
+    Examples:
+        >>> import tempfile
+        >>> few = Points(np.array([[0.0, 0.0, 0.5]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.5]))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_mesh(f"{folder}/mesh.ply", few).reason
+        '1 distinct surface points are too few for a mesh, which needs 50'
+    """
     mesh, report = poisson_mesh(points, depth, trim)
     if mesh is not None:
         import open3d
 
         with whole_file(path) as partial:
-            if not open3d.io.write_triangle_mesh(str(partial), mesh):
+            if not open3d.io.write_triangle_mesh(partial, mesh):
                 raise OSError(f"Open3D could not write {path}")
     return report

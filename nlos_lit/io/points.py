@@ -1,4 +1,4 @@
-"""Surface points, and binary PLY files of them."""
+"""Points on the hidden surface, and binary PLY files of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.io.files import whole_file
-from nlos_lit.io.volumes import AXES
 
 PLY_TYPES = {
     "float": "<f4",
@@ -34,6 +33,11 @@ class Points:
     Raises:
         ValueError: shapes disagree, values are NaN or infinite, or normals are not unit vectors (within
             1e-3).
+
+    Examples:
+        >>> points = Points(np.array([[0.0, 0.1, 0.8]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.5]))
+        >>> len(points), points.intensity is None
+        (1, True)
     """
 
     positions: np.ndarray
@@ -65,11 +69,26 @@ class Points:
 
 
 def write_points(path: Path | str, points: Points) -> None:
-    """Binary PLY with position (m), normal, ``albedo`` and ``intensity`` as floats, and a grey colour for
+    """Write points as binary PLY.
+
+    Each has position (m), normal, ``albedo`` and, where known, ``intensity`` as floats, and a grey colour for
     viewers.
+
+    Args:
+        path: PLY file, written whole or not at all.
+        points: any number of them, also none.
+
+    Examples:
+        >>> import tempfile
+        >>> points = Points(np.array([[0.0, 0.25, 0.5]]), np.array([[0.0, 0.0, -1.0]]), np.array([0.5]))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_points(f"{folder}/points.ply", points)
+        ...     back = read_points(f"{folder}/points.ply")
+        >>> back.positions.tolist(), back.albedo.tolist()
+        ([[0.0, 0.25, 0.5]], [0.5])
     """
-    columns = {name: points.positions[:, k] for k, name in enumerate(AXES)}
-    columns |= {f"n{name}": points.normals[:, k] for k, name in enumerate(AXES)}
+    columns = {name: points.positions[:, k] for k, name in enumerate("xyz")}
+    columns |= {f"n{name}": points.normals[:, k] for k, name in enumerate("xyz")}
     columns["albedo"] = points.albedo
     if points.intensity is not None:
         columns["intensity"] = points.intensity
@@ -95,13 +114,30 @@ def write_points(path: Path | str, points: Points) -> None:
 
 
 def grey_levels(albedo: np.ndarray) -> np.ndarray:
-    """``[N]`` brightness in 0 … 1 to look at; relative: the albedo's 98th percentile is white."""
+    """Brightness to look at: relative, the albedo's 98th percentile is white.
+
+    Args:
+        albedo: ``[N]``.
+
+    Returns:
+        ``[N]`` in 0 … 1.
+
+    Examples:
+        >>> grey_levels(np.array([0.0, 0.1, 0.2, 0.2])).tolist()
+        [0.0, 0.5, 1.0, 1.0]
+    """
     white = np.quantile(albedo, 0.98) if len(albedo) else 0.0
     return np.clip(albedo / white, 0, 1) if white > 0 else np.zeros(len(albedo))
 
 
 def read_points(path: Path | str) -> Points:
-    """What ``write_points`` wrote; colours are not read back.
+    """Read what :func:`write_points` wrote; colours are not read back.
+
+    Args:
+        path: PLY file.
+
+    Returns:
+        The points, ``intensity`` only if the file has it.
 
     Raises:
         UserError: the file is missing, cut, not a binary little-endian PLY, or without normals or albedo.
@@ -114,15 +150,14 @@ def read_points(path: Path | str) -> Points:
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     if not found or lines[0] != ["ply"] or ["format", "binary_little_endian", "1.0"] not in lines:
         raise UserError(f"{path} is not a binary little-endian PLY file")
-    counts = [
-        line[2] for line in lines if line[:1] == ["element"] and line[1:2] == ["vertex"] and len(line) == 3
-    ]
+    counts = [line[2] for line in lines if line[:2] == ["element", "vertex"] and len(line) == 3]
     fields = [line[1:] for line in lines if line[:1] == ["property"]]
     names = [field[-1] for field in fields if len(field) == 2 and field[0] in PLY_TYPES]
     complete = len(set(names)) == len(fields) and {"x", "y", "z", "nx", "ny", "nz", "albedo"} <= set(names)
     if not complete or len(counts) != 1 or not counts[0].isdigit():
         raise UserError(
-            f"{path} must hold one list of points with x, y, z, nx, ny, nz and albedo, all once; found {names}"
+            f"{path} must hold one list of points with x, y, z, nx, ny, nz and albedo, all once; "
+            f"found {names}"
         )
     kind, count = np.dtype([(field[1], PLY_TYPES[field[0]]) for field in fields]), int(counts[0])
     if len(body) < count * kind.itemsize:
@@ -130,7 +165,7 @@ def read_points(path: Path | str) -> Points:
             f"{path} is cut: its {count} points need {count * kind.itemsize} bytes, {len(body)} are there"
         )
     rows = np.frombuffer(body, dtype=kind, count=count)
-    positions, normals = (np.stack([rows[prefix + name] for name in AXES], axis=1) for prefix in ("", "n"))
+    positions, normals = (np.stack([rows[prefix + name] for name in "xyz"], axis=1) for prefix in ("", "n"))
     try:
         return Points(positions, normals, rows["albedo"], rows["intensity"] if "intensity" in names else None)
     except ValueError as error:

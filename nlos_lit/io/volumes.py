@@ -17,11 +17,25 @@ AXES = ("x", "y", "z")
 def write_volume(
     path: Path | str, values: np.ndarray, grid: VolumeGrid, **extra_datasets: np.ndarray
 ) -> None:
-    """HDF5 with ``volume`` [nz, nx, ny] float32, its axes ``x``, ``y``, ``z`` in metres, and a dataset for
-    each extra volume.
+    """Write a volume, its axes ``x``, ``y``, ``z`` in metres, and volumes that belong to it.
+
+    Args:
+        path: HDF5 file, written whole or not at all.
+        values: ``[nz, nx, ny]``, kept as float32 under the name ``volume``.
+        grid: where the voxels lie.
+        extra_datasets: more volumes of the same shape, each under its name.
 
     Raises:
         ValueError: ``values`` or an extra volume is not of the grid's shape.
+
+    Examples:
+        >>> import tempfile
+        >>> grid = VolumeGrid((0.0, 0.0, 0.5), (0.1, 0.1, 0.25), (2, 1, 2))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_volume(f"{folder}/volume.h5", np.arange(4).reshape(2, 1, 2), grid)
+        ...     volume, where, extra = read_volume(f"{folder}/volume.h5")
+        >>> volume.tolist(), where == grid, extra
+        ([[[0.0, 1.0]], [[2.0, 3.0]]], True, {})
     """
     volumes = {"volume": values, **extra_datasets}
     for name, array in volumes.items():
@@ -44,7 +58,13 @@ def write_volume(
 
 
 def read_volume(path: Path | str) -> tuple[np.ndarray, VolumeGrid, dict[str, np.ndarray]]:
-    """What ``write_volume`` wrote: ``volume`` [nz, nx, ny] float32, its grid, and the extra datasets by name.
+    """Read what :func:`write_volume` wrote.
+
+    Args:
+        path: HDF5 file.
+
+    Returns:
+        ``volume`` ``[nz, nx, ny]`` float32, its grid, and the extra volumes by name.
 
     Raises:
         UserError: the file is missing, is not HDF5, or holds no volume on a grid.
