@@ -1,84 +1,21 @@
 """Classical baselines in the project's frame: ``python reconstruct.py scene=su method=lct``."""
 
-from __future__ import annotations
-
-import logging
 import sys
-import time
-from pathlib import Path
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from data_modules.load import load_scene
-from nlos_lit.baselines import estimate_bytes, reconstruct_directed
-from nlos_lit.baselines.surface import front_points
-from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.io.files import write_json
-from nlos_lit.io.points import write_points
-from nlos_lit.io.volumes import write_volume
-from nlos_lit.metrics.geometry import geometry_errors
-from nlos_lit.report import figures
-from nlos_lit.runtime.command_line import quote_numbers, refuse_finished_folder, sentence_errors, write_config
-from nlos_lit.runtime.memory import check_machine, parse_bytes, peak_bytes
-from nlos_lit.training.summary import git_state, versions
-
-log = logging.getLogger(__name__)
+from nlos_lit.commands.reconstruct import prepare, reconstruct
+from nlos_lit.runtime.command_line import sentence_errors
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="reconstruct")
 @sentence_errors
 def main(config: DictConfig) -> None:
-    began = time.perf_counter()
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    settings = write_config(config, folder)
-    scene, method = settings["scene"], settings["method"]
-    capture, truth = load_scene(scene, settings["data_dir"], settings["seed"])
-    grid = volume_grid(capture, **scene["volume"])
-    needed = estimate_bytes(capture, grid, method["name"])
-    check_machine(needed, f"method={method['name']}")
-    log.info(
-        "%s: volume %d x %d x %d voxels, about %.2f GiB",
-        method["name"],
-        *grid.shape[1:],
-        grid.shape[0],
-        needed / 2**30,
-    )
-    setup = time.perf_counter() - began
-    budget = parse_bytes(settings["memory_budget"])
-    volume, field = reconstruct_directed(
-        capture, grid, method["name"], budget_bytes=budget, **method["options"]
-    )
-    seconds = time.perf_counter() - began - setup
-    values = (volume / volume.max().clamp_min(1e-30)).numpy()
-    write_volume(folder / "volume.h5", values, grid)
-    shown = figures.volume_projections(
-        values, grid, threshold=scene["threshold"], title=f"{scene['name']}, {method['name']}"
-    )
-    figures.save_figure(shown, folder / "figures" / "volume.png")
-    points = front_points(values, grid, scene["threshold"], None if field is None else field.numpy())
-    write_points(folder / "points.ply", points)
-    figures.save_figure(figures.surface_plot(points), folder / "figures" / "surface.png")
-    summary = {
-        "scene": scene["name"],
-        "method": method,
-        "geometry": None,
-        "seconds": {"setup": setup, "method": seconds, "total": time.perf_counter() - began},
-        "peak_memory_bytes": peak_bytes(),
-        "estimated_memory_bytes": needed,
-        "versions": versions(),
-        "git": git_state(),
-        "seed": settings["seed"],
-    }
-    if truth is not None:
-        spacing = max(abs(step) for step in grid.pitch[:2])
-        summary["geometry"] = geometry_errors(points, truth, lateral_tolerance=spacing).to_dict()
-    write_json(folder / "summary.json", summary)
-    log.info("%.1f s; results in %s", seconds, folder)
+    """Open the command."""
+    reconstruct(config)
 
 
 if __name__ == "__main__":
-    quote_numbers(sys.argv)
-    refuse_finished_folder(sys.argv[1:])
+    prepare(sys.argv)
     main()

@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT))
 from nlos_lit.capture import Capture
 from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.model.build import PipelineSettings, build_pipeline, match_energy, normalisation
-from nlos_lit.model.objective import Objective, adam
+from nlos_lit.model.objective import Objective, rated_groups
 from nlos_lit.model.phasor import PhasorPlan
 from nlos_lit.model.pipeline import Pipeline
 
@@ -254,7 +254,7 @@ class Training:
         match_energy(
             self.pipeline, self.capture, torch.from_numpy(self._draw(2 * self.workload.batch)).to(self.device)
         )
-        self.optimiser = adam(self.pipeline, RATES, list(RATES))
+        self.optimiser = torch.optim.Adam(rated_groups(self.pipeline, RATES, list(RATES)))
         self.synchronise()
         return time.perf_counter() - began
 

@@ -54,8 +54,8 @@ class PipelineSettings:
             splat (Eq. 9).
         jitter_fwhm_ps: start of σ_ls, as full width at half maximum, ps.
         decay_per_bin: start of κ_s, 1/bin.
-        background_start: start of η_s as a fraction of the normalisation; None takes the quietest sixteenth of
-            the gate.
+        background_start: start of η_s as a fraction of the normalisation; None takes the quietest sixteenth
+            of the gate.
         basis_tolerance: relative error of the virtual spectrum in the stored basis.
     """
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
+from nlos_lit.capture.errors import UserError
 from nlos_lit.functional.losses import albedo_variation, sparsity, transient_loss
 from nlos_lit.model.pipeline import Pipeline
 
 
 class Objective(NamedTuple):
-    """Factors of the objective.
+    """Factors of the objective ``E = E_H + λ1 · mean max_z I_pf + λ2 · TV(ρ)``, Eq. 11-14.
 
     Args:
         scale: counts that the loss counts as 1.
-        lambda_sparsity, lambda_albedo: λ1 and λ2.
+        lambda_sparsity: λ1, of the depth-projected intensity.
+        lambda_albedo: λ2, of the albedo's variation.
         albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes
             all.
         seed: of the batches of voxels.
@@ -29,8 +32,16 @@ class Objective(NamedTuple):
     seed: int = 0
 
     def terms(self, pipeline: Pipeline, spots: Tensor, counts: Tensor, step: int) -> dict[str, Tensor]:
-        """Loss terms and their sum over a batch: ``spots`` ``[S]``, gated ``counts`` ``[S, T]``, number of
-        the iteration.
+        """Loss terms of a batch and their sum.
+
+        Args:
+            pipeline: the simulated measurement.
+            spots: ``[S]`` rows of the capture.
+            counts: ``[S, T]`` their gated counts.
+            step: number of the iteration; chooses the batch of voxels.
+
+        Returns:
+            ``transient``, ``sparsity``, ``albedo`` and their sum ``loss``, scalars.
         """
         rendering = pipeline(spots)
         terms = {"transient": transient_loss(counts / self.scale, rendering.expected / self.scale)}
@@ -39,14 +50,30 @@ class Objective(NamedTuple):
         return terms
 
     def regularisation(self, intensity: Tensor, albedo: Tensor) -> dict[str, Tensor]:
-        """E_Ipf and E_ρ with their factors, over a volume and (planes of) an albedo volume."""
+        """E_Ipf and E_ρ with their factors.
+
+        Args:
+            intensity: ``[nz, nx, ny]`` I_pf.
+            albedo: ``[m, nx, ny]`` ρ, or planes of it.
+
+        Returns:
+            ``sparsity`` and ``albedo``, scalars.
+        """
         return {
             "sparsity": self.lambda_sparsity * sparsity(intensity),
             "albedo": self.lambda_albedo * albedo_variation(albedo),
         }
 
     def voxel_batch(self, albedo: Tensor, step: int) -> Tensor:
-        """The planes of E_ρ in this iteration."""
+        """The planes of E_ρ in this iteration.
+
+        Args:
+            albedo: ``[nz, nx, ny]`` ρ.
+            step: number of the iteration.
+
+        Returns:
+            ``[m, nx, ny]``, m random planes; all where the volume has no more.
+        """
         planes = albedo.shape[0]
         if self.albedo_planes is None or self.albedo_planes >= planes:
             return albedo
@@ -64,15 +91,34 @@ def parameter_groups(pipeline: Pipeline) -> dict[str, list[nn.Parameter]]:
     }
 
 
-def adam(pipeline: Pipeline, rates: dict[str, float], optimised: list[str]) -> torch.optim.Adam:
-    """Adam on the unconstrained parameters of the groups ``optimised``, each at its rate."""
+def rated_groups(
+    pipeline: Pipeline, rates: Mapping[str, float], optimised: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Parameter groups as optimisers of torch take them.
+
+    Args:
+        pipeline: whose unconstrained parameters are fitted.
+        rates: learning rate of every group, fitted or not.
+        optimised: names of the groups that are fitted.
+
+    Returns:
+        One ``{"params", "lr", "name"}`` a fitted group.
+
+    Raises:
+        UserError: a group without a rate, or a rate without a group.
+    """
     groups = parameter_groups(pipeline)
-    return torch.optim.Adam([{"params": groups[name], "lr": rates[name], "name": name} for name in optimised])
+    if set(rates) != set(groups):
+        raise UserError(
+            f"optimizer.rates must give one rate for each of {', '.join(groups)}; found {', '.join(rates)}"
+        )
+    return [{"params": groups[name], "lr": rates[name], "name": name} for name in optimised]
 
 
 def communicated_bytes(pipeline: Pipeline) -> int:
-    """What each process of a distributed run hands over in an iteration: gradients and, where the field is
-    shared, its volume's.
+    """Bytes that each process of a distributed run hands over in an iteration.
+
+    They are the gradients and, where the field is shared, planes of the volume.
     """
     gradients = sum(
         p.numel() * p.element_size() for group in parameter_groups(pipeline).values() for p in group

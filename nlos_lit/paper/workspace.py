@@ -1,4 +1,4 @@
-"""Where experiments keep what is expensive: captures, trainings and arrays, each made once and found again."""
+"""Where experiments keep what is expensive: captures, trainings, arrays, each made once and found again."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 
 from data_modules.load import load_scene
 from data_modules.simulate import Mesh, load_truth
@@ -26,6 +24,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.io.files import whole_file
+from nlos_lit.training.configs import compose
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +34,13 @@ Arrays = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Subject:
-    """A capture to work on: the settings by which ``train.py`` takes it, and what tables call it."""
+    """A capture to work on.
+
+    Args:
+        name: in file names.
+        label: in tables.
+        overrides: settings by which ``train.py`` takes it.
+    """
 
     name: str
     label: str
@@ -49,8 +54,15 @@ class Subject:
 
 @dataclass(frozen=True)
 class Scene:
-    """A subject, loaded: as ``train.py`` would see it. ``mesh`` and ``truth`` are None where the truth is not
-    known.
+    """A subject, loaded: as ``train.py`` would see it.
+
+    Args:
+        capture: ready to fit.
+        truth: the true surface; None where it is not known.
+        mesh: the true scene; None where it is not known.
+        grid: the volume.
+        falloff: power of distance with which counts fall, for LCT and f-k.
+        threshold: share of the largest intensity below which there is no surface.
     """
 
     capture: Capture
@@ -73,11 +85,17 @@ class Scene:
 
 
 def run_training(arguments: list[str], output: Path) -> int:
-    """``train.py`` with ``arguments`` in a process of its own; what it prints goes to ``output``. Returns its
-    exit status.
+    """``train.py`` in a process of its own.
 
     The process is forked from a server that has imported the libraries and done nothing else: imports take
     longer than a small training.
+
+    Args:
+        arguments: of its command line.
+        output: file for what it prints.
+
+    Returns:
+        Its exit status.
     """
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(
@@ -91,6 +109,7 @@ def run_training(arguments: list[str], output: Path) -> int:
         process.terminate()
         process.join()
         raise
+    assert process.exitcode is not None  # it was joined
     return process.exitcode
 
 
@@ -130,7 +149,8 @@ class Workspace:
         if path is None:
             places = ", ".join(map(str, self.data)) or "no folder"
             raise UserError(
-                f"this experiment needs {name}; found none below {places}. Give the folder that holds it: data=DIR"
+                f"this experiment needs {name}; found none below {places}. "
+                "Give the folder that holds it: data=DIR"
             )
         return path
 
@@ -141,7 +161,15 @@ class Workspace:
         return path
 
     def kept(self, name: str, compute: Callable[[], dict[str, Any]]) -> Arrays:
-        """Named arrays (or numbers), computed once and read from ``kept/NAME.npz`` from then on."""
+        """Named arrays (or numbers), computed once and read from ``kept/NAME.npz`` from then on.
+
+        Args:
+            name: of the file.
+            compute: makes them.
+
+        Returns:
+            Name → array.
+        """
         path = self.path(f"kept/{name}.npz")
         if not path.exists():
             log.info("computing %s", name)
@@ -152,12 +180,16 @@ class Workspace:
             return {key: stored[key] for key in stored.files}
 
     def train(self, name: str, subject: Subject, *overrides: str, start: Path | None = None) -> Path:
-        """The run folder of a training, trained now unless a finished one is there; an interrupted one goes
-        on.
+        """The run folder of a training, trained unless it is there; an interrupted one goes on.
 
         Args:
+            name: of the folder.
+            subject: what is trained on.
             overrides: further settings of ``train.py``.
             start: a finished shorter run to go on from.
+
+        Returns:
+            The folder of the finished run.
 
         Raises:
             UserError: the training failed, or the stored one had other settings.
@@ -169,7 +201,8 @@ class Workspace:
             used = [item for item in yaml.safe_load(stored.read_text()) if not item.startswith("ckpt_path=")]
             if used != wanted:
                 raise UserError(
-                    f"{folder} was trained with other settings ({used}, now {wanted}); remove it to train anew"
+                    f"{folder} was trained with other settings ({used}, now {wanted}); "
+                    "remove it to train anew"
                 )
         if (folder / "summary.json").exists():
             return folder
@@ -190,10 +223,20 @@ class Workspace:
         return folder
 
     def open(self, subject: Subject, *overrides: str) -> Scene:
-        """The subject's capture, truth and volume."""
+        """The subject's capture, truth and volume.
+
+        Args:
+            subject: what is opened.
+            overrides: further settings of ``train.py``.
+
+        Returns:
+            What was read, with the volume that a training would image.
+
+        Raises:
+            UserError: the data are not there or not usable.
+        """
         chosen = [f"experiment={self.experiment}", *subject.overrides, *overrides]
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            config = OmegaConf.to_container(compose("train", overrides=chosen), resolve=True)
+        config = compose("train", chosen)
         scene = config["scene"]
         capture, truth = load_scene(scene, config["data_dir"], config["seed"])
         mesh = load_truth(scene["truth"]).mesh if scene["truth"] is not None else None

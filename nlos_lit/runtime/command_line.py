@@ -9,15 +9,19 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
-from omegaconf import OmegaConf
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nlos_lit.capture.errors import UserError
 
 
 def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
-    """Print a :class:`UserError` as one sentence and exit with status 2; anything else keeps its traceback."""
+    """Print a :class:`~nlos_lit.capture.errors.UserError` as one sentence and exit with status 2.
+
+    Anything else keeps its traceback.
+    """
 
     @functools.wraps(task)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -31,12 +35,15 @@ def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> None:
-    """Exit before anything is written when ``hydra.run.dir`` names a folder that holds a finished run and
-    nothing is resumed.
+    """Exit with status 2, before anything is written, where ``hydra.run.dir`` holds a finished run.
 
-    ``diagnosis``: also when it holds a diagnosis.
+    It may where the run is resumed.
+
+    Args:
+        arguments: of the command line, ``key=value``.
+        diagnosis: a folder that holds a diagnosis is refused, too.
     """
-    given = dict(item.split("=", 1) for item in arguments if "=" in item)
+    given = _given(arguments)
     folder = given.get("hydra.run.dir")
     if diagnosis and folder is not None and (Path(folder) / "diagnosis" / "diagnosis.json").exists():
         print(f"error: {folder} already holds a diagnosis; choose another hydra.run.dir", file=sys.stderr)
@@ -51,10 +58,8 @@ def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> Non
 
 
 def stay_in_run(arguments: list[str]) -> None:
-    """``run=FOLDER`` keeps log and config in FOLDER/diagnosis, too; in place. Exit where FOLDER is not a
-    run's.
-    """
-    given = dict(item.split("=", 1) for item in arguments if "=" in item)
+    """With ``run=FOLDER``, add arguments that keep log and config in it; exit where it is no run's folder."""
+    given = _given(arguments)
     if given.get("run", "null") == "null":
         return
     folder = Path(given["run"].strip("'\""))
@@ -65,22 +70,46 @@ def stay_in_run(arguments: list[str]) -> None:
         arguments += [f"hydra.run.dir='{folder}'", "hydra.output_subdir=diagnosis/.hydra"]
 
 
+def output_folder() -> Path:
+    """Where Hydra puts what the running command writes."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def _given(arguments: list[str]) -> dict[str, str]:
+    return dict(item.split("=", 1) for item in arguments if "=" in item)
+
+
 def quote_numbers(arguments: list[str]) -> None:
-    """``scene=34`` → ``scene='34'`` in place: Hydra would take a scene whose name is a number for a number."""
+    """``scene=34`` → ``scene='34'`` in place: Hydra would take the scene's name for a number.
+
+    Examples:
+        >>> arguments = ["train.py", "scene=34", "seed=1"]
+        >>> quote_numbers(arguments)
+        >>> arguments
+        ['train.py', "scene='34'", 'seed=1']
+    """
     for index, argument in enumerate(arguments):
         arguments[index] = re.sub(r"^(scene)=(\d+)$", r"\1='\2'", argument)
 
 
-def write_config(config: Any, folder: Path) -> dict[str, Any]:
-    """Resolve the config, keep it as ``config.yaml`` in the run's folder, return it as plain containers."""
-    resolved = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+def write_config(config: DictConfig, folder: Path) -> dict[str, Any]:
+    """Resolve the config and keep it as ``config.yaml`` in the run's folder.
+
+    Args:
+        config: as Hydra composed it.
+        folder: of the run; made where it is not there.
+
+    Returns:
+        The config as plain containers.
+    """
+    resolved = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(resolved)))
     return resolved
 
 
 def quiet_libraries() -> None:
-    """Silence advice that does not apply here (one epoch is one iteration; a batch is gathered, not loaded)."""
+    """Silence advice that does not apply: an epoch is an iteration, a batch is gathered and not loaded."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", ".*does not have many workers.*")
     warnings.filterwarnings("ignore", ".*The number of training batches.*")

@@ -1,4 +1,4 @@
-"""What a finished run leaves in its folder."""
+"""What a finished run leaves in its folder, and how to load what it refined."""
 
 from __future__ import annotations
 
@@ -23,24 +23,21 @@ from nlos_lit.io.points import Points, write_points
 from nlos_lit.io.volumes import write_volume
 from nlos_lit.metrics.geometry import depth_map, geometry_errors
 from nlos_lit.report import figures
+from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import planes_progress
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.refine import RefineSettings, refine
-from nlos_lit.training.callbacks import History, run_figures, spot_labels, surface_points
+from nlos_lit.training.callbacks import History
+from nlos_lit.training.configs import settings_of
 from nlos_lit.training.run_folder import Run
+from nlos_lit.training.shown import run_figures, shown_spots, spot_labels, surface_points
 from nlos_lit.training.summary import build_summary
 
 log = logging.getLogger(__name__)
 
 
-def shown_spots(n_spots: int, count: int) -> np.ndarray:
-    """``count`` spots spread over the scan along a golden-ratio sequence (no row or column is favoured)."""
-    golden = (np.arange(1, count + 1) * 0.6180339887498949) % 1.0
-    return np.unique((golden * n_spots).astype(np.int64))
-
-
 def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
-    """Masks ``[nx, ny]`` of the bright and the dark half of the true albedos; None where there is one albedo."""
+    """Masks ``[nx, ny]`` of the bright and the dark half of the true albedos; None where all are equal."""
     if truth.albedo is None:
         return None
     seen = np.isfinite(truth.albedo) & (truth.albedo > 0)
@@ -52,22 +49,37 @@ def albedo_regions(truth: SurfaceTruth) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def refine_run(run: Run, folder: Path) -> dict[str, Any]:
-    """Fit surfels, with the run's effects, to the training spots from its image; points, mesh, figures and
-    model in ``refined/``.
+    """Fit surfels, with the run's effects, to the training spots, starting from the run's image.
 
-    Returns the summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors
-    where truth is known.
+    Args:
+        run: fitted.
+        folder: of the run; points, mesh, figures and model go to ``refined/`` in it.
+
+    Returns:
+        The summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors where
+        truth is known.
+
+    Raises:
+        UserError: the image holds no place that could be a surfel.
     """
     module, capture, place = run.module, run.capture, folder / "refined"
     grid = module.pipeline.phasor.grid
     with torch.no_grad():
         intensity = module.pipeline.phasor().cpu()
-    settings = RefineSettings(**run.config["surfels"])
+    settings = settings_of(RefineSettings, run.config["surfels"], "surfels")
     with planes_progress("refining surfels") as progress:
         refined = refine(
-            capture, intensity, grid, settings, run.data.train_spots, extension=run.extension, progress=progress,
-            seed=run.config["seed"], heldout_spots=run.data.heldout_spots, scan_shapes=True,
-        )  # fmt: skip
+            capture,
+            intensity,
+            grid,
+            settings,
+            run.data.train_spots,
+            extension=run.extension,
+            progress=progress,
+            seed=run.config["seed"],
+            heldout_spots=run.data.heldout_spots,
+            scan_shapes=True,
+        )
     points = refined.points()
     write_points(place / "points.ply", points)
     mesh = write_mesh(place / "mesh.ply", points, depth=run.config["export"]["mesh_depth"])
@@ -76,15 +88,15 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
     with whole_file(place / "effects.pt") as temporary:
         names = [effect.name for effect in refined.extension.effects]
         torch.save({"names": names, "state": refined.extension.state_dict()}, temporary)
-    spots = shown_spots(capture.n_spots, run.config["monitor"]["spots"])
+    spots = shown_spots(capture.n_spots, run.config["export"]["transients"])
     path = capture.path_gate[0] + (np.arange(capture.gate[1] - capture.gate[0]) + 0.5) * capture.bin_length
     with torch.no_grad():
         rendered = refined.expected(torch.from_numpy(spots)).numpy()
     shown = figures.transients_plot(
         capture.gated_counts()[spots], rendered, path, spot_labels(capture, spots)
     )
-    figures.save_figure(shown, place / "transients.png")
-    figures.save_figure(figures.surface_plot(points), place / "surface.png")
+    save_figure(shown, place / "transients.png")
+    save_figure(figures.surface_plot(points), place / "surface.png")
     return {
         "surfels": len(refined.model),
         "heldout": dataclasses.asdict(refined.heldout),
@@ -99,11 +111,14 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
 
 
 def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Extension]:
-    """Surfels and effects that a run left in ``folder``; ``model.expected(spots, extension)`` are its
-    expected counts.
+    """Surfels and effects of a refined run; ``model.expected(spots, extension)`` are its expected counts.
 
     Args:
+        folder: of the run.
         capture: the run's, as :func:`~nlos_lit.training.run_folder.open_run` gives it.
+
+    Returns:
+        The surfels with the response, and the effects fitted along.
 
     Raises:
         UserError: the run was not refined.
@@ -112,7 +127,8 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
     for name in ("surfels.pt", "effects.pt"):
         if not (place / name).exists():
             raise UserError(
-                f"{folder} holds no refined surfels: refined/{name} is missing; run train.py with refine=true or effects=[…]"
+                f"{folder} holds no refined surfels: refined/{name} is missing; "
+                "run train.py with refine=true or effects=[…]"
             )
     saved = torch.load(place / "effects.pt", map_location="cpu", weights_only=True)
     extension = Extension(build_effects(saved["names"], Scan.of(capture)))
@@ -135,7 +151,18 @@ def _geometry(points: Points, run: Run) -> dict[str, float] | None:
 def write_results(
     run: Run, history: History, folder: Path, total_seconds: float, refined: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """Volume, points, mesh, figures and ``summary.json``; returns the summary."""
+    """Write volume, points, mesh, figures and ``summary.json``.
+
+    Args:
+        run: fitted and scored.
+        history: of its iterations.
+        folder: where to.
+        total_seconds: since the command began.
+        refined: the summary's entry of :func:`refine_run`; None where the run was not refined.
+
+    Returns:
+        The summary.
+    """
     module, capture, config = run.module, run.capture, run.config
     pipeline = module.pipeline
     with torch.no_grad():
@@ -149,7 +176,7 @@ def write_results(
     if mesh.reason:
         log.warning("mesh.ply: %s", mesh.reason)
     geometry = _geometry(points, run)
-    shown = run_figures(module, capture, shown_spots(capture.n_spots, config["monitor"]["spots"]))
+    shown = run_figures(module, capture, shown_spots(capture.n_spots, config["export"]["transients"]))
     if geometry is not None:
         x, y = run.truth.x, run.truth.y
         shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)
@@ -170,7 +197,7 @@ def write_results(
             track, {name: entry["unit"] for name, entry in parameters.items()}
         )
     for name, figure in shown.items():
-        figures.save_figure(figure, folder / "figures" / f"{name}.png")
+        save_figure(figure, folder / "figures" / f"{name}.png")
     first, last = module.scores["initial"], module.scores["final"]
     summary = build_summary(
         scene=config["scene"]["name"],

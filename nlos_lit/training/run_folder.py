@@ -1,4 +1,4 @@
-"""A run, from config to results: built by ``train.py``, opened again by later commands."""
+"""A run, from config to fit: built by ``train.py``, opened again by later commands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
+from torch.optim import Optimizer
 
 from data_modules.load import load_scene
 from data_modules.spots import CaptureDataModule
@@ -23,22 +23,32 @@ from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.model.build import PipelineSettings, build_pipeline, match_energy, normalisation
+from nlos_lit.model.objective import Objective
 from nlos_lit.model.phasor import PhasorPlan
-from nlos_lit.runtime.memory import check_machine, parse_bytes, resident_bytes
+from nlos_lit.runtime.memory import SMALLER, check_machine, parse_bytes, resident_bytes
 from nlos_lit.runtime.progress import planes_progress
+from nlos_lit.training.configs import run_config, settings_of
+from nlos_lit.training.instantiate import builder
 from nlos_lit.training.self_calibration import SelfCalibration
 
 log = logging.getLogger(__name__)
 
 LATER_LIBRARIES = 100 * 2**20  # what logging, figures and export load after the estimate
 
-_MODULE_KEYS = ("rates", "clip", "lambda_sparsity", "lambda_albedo", "albedo_planes")
-
 
 @dataclass
 class Run:
-    """A capture with the module that is fitted to it, and effects, at their nulls, that are fitted with the
-    surfels.
+    """A capture with the module that is fitted to it.
+
+    Args:
+        config: resolved, as ``config.yaml`` of the run's folder holds it.
+        capture: the measurement.
+        truth: the true surface; None where it is not known.
+        data: batches of spots, held-out spots.
+        module: what is fitted.
+        setup_seconds: from the config to the first iteration.
+        estimated_bytes: largest memory the run is expected to take.
+        extension: effects, at their nulls, that are fitted with the surfels.
     """
 
     config: dict[str, Any]
@@ -49,11 +59,6 @@ class Run:
     setup_seconds: float
     estimated_bytes: int
     extension: Extension
-
-
-def pipeline_settings(model: Mapping[str, Any]) -> PipelineSettings:
-    """What the pipeline takes of a ``model`` config; the rest is the optimiser's."""
-    return PipelineSettings(**{name: value for name, value in model.items() if name not in _MODULE_KEYS})
 
 
 def field_shards(config: Mapping[str, Any]) -> int:
@@ -67,18 +72,23 @@ def field_shards(config: Mapping[str, Any]) -> int:
         return 1
     if not isinstance(devices, int) or devices < 2:
         raise UserError(
-            "shard_field=true divides the phasor field among processes, which needs trainer=ddp and trainer.devices=2 or more; "
-            f"found trainer.devices={devices}"
+            "shard_field=true divides the phasor field among processes, which needs trainer=ddp and "
+            f"trainer.devices=2 or more; found trainer.devices={devices}"
         )
     return devices
 
 
 def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", shards: int = 1) -> Run:
-    """Everything before the first iteration: capture, volume, memory estimate, propagated phasor field, start
-    values.
+    """Everything before the first iteration: capture, volume, memory, propagated phasor field, start values.
 
-    Where several processes share the field (``shards``), it and the start values are made when the fit
-    begins.
+    Args:
+        config: resolved, of ``train.py``.
+        device: where the phasor field and the parameters are put.
+        shards: processes that share the field; where there are several, it and the start values are made when
+            the fit begins.
+
+    Returns:
+        The run, ready to fit.
 
     Raises:
         UserError: the data, the geometry or the settings cannot work; nothing has been written then.
@@ -86,7 +96,7 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
     began = time.perf_counter()
     scene, seed = config["scene"], int(config["seed"])
     capture, truth = load_scene(scene, config["data_dir"], seed)
-    effects = config.get("effects", [])  # of older runs' folders: none
+    effects = config["effects"]
     extension = Extension(build_effects([effects] if isinstance(effects, str) else effects, Scan.of(capture)))
     grid = volume_grid(capture, **scene["volume"])
     data = CaptureDataModule(
@@ -97,17 +107,18 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
         monitor_spots=config["heldout"]["monitor_spots"],
         seed=seed,
     )
-    settings = pipeline_settings(config["model"])
+    settings = settings_of(PipelineSettings, config["model"], "model")
+    method = builder(config["optimizer"]["method"], Optimizer, "optimizer.method")
     pipeline = build_pipeline(capture, grid, settings).to(device)
     plan = pipeline.phasor.plan(capture, parse_bytes(config["memory_budget"]), shards)
     rays = settings.rays**2 * config["batch_spots"]
     planned = run_bytes(plan, grid.n_voxels, rays) + LATER_LIBRARIES
-    check_machine(planned * shards, "this run")
+    check_machine(planned * shards, "this run", f"{SMALLER}, or lower batch_spots")
     estimated = planned + resident_bytes()
     log.info(
         "%s: %d spots x %d bins of %.3g ps, %s; volume %d x %d x %d voxels, depth %.3g to %.3g m",
-        scene["name"], capture.n_spots, capture.n_bins, capture.bin_width_ps, capture.kind, *grid.shape[1:], grid.shape[0],
-        grid.z[0], grid.z[-1],
+        scene["name"], capture.n_spots, capture.n_bins, capture.bin_width_ps, capture.kind,
+        *grid.shape[1:], grid.shape[0], grid.z[0], grid.z[-1],
     )  # fmt: skip
     log.info("%s; about %.1f GiB in all", plan, estimated / 2**30)
     imaged = None if config["heldout"]["imaging"] else data.train_spots
@@ -125,17 +136,13 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
 
     if shards == 1:
         prepare()
-    model, optimise = config["model"], config["ablation"]["optimise"]
+    scale = normalisation(capture)
     module = SelfCalibration(
         pipeline,
-        normalisation(capture),
-        optimise=optimise,
-        rates=model["rates"],
-        lambda_sparsity=model["lambda_sparsity"],
-        lambda_albedo=model["lambda_albedo"],
-        albedo_planes=model["albedo_planes"],
-        clip=model["clip"],
-        seed=seed,
+        settings_of(Objective, config["objective"], "objective", scale=scale, seed=seed),
+        optimise=config["ablation"]["optimise"],
+        optimizer=method,
+        rates=config["optimizer"]["rates"],
         prepare=prepare_shared if shards > 1 else None,
     )
     run = Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated, extension)
@@ -145,17 +152,22 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
 def open_run(folder: str | Path) -> Run:
     """A finished run as its folder holds it: resolved config, capture, fitted module.
 
+    Args:
+        folder: of the run.
+
+    Returns:
+        The run, on the CPU, its parameters as fitted.
+
     Raises:
-        UserError: the folder is not a run, or has no checkpoint.
+        UserError: the folder is not a run's, has no checkpoint, or is of another version.
     """
     folder = Path(folder)
-    config_file, checkpoint = folder / "config.yaml", folder / "checkpoints" / "last.ckpt"
-    for needed in (config_file, checkpoint):
-        if not needed.exists():
-            raise UserError(
-                f"{folder} is not the folder of a finished run: {needed.relative_to(folder)} is missing"
-            )
-    run = prepare_run(OmegaConf.to_container(OmegaConf.load(config_file)))
+    config, checkpoint = run_config(folder), folder / "checkpoints" / "last.ckpt"
+    if not checkpoint.exists():
+        raise UserError(
+            f"{folder} is not the folder of a finished run: {checkpoint.relative_to(folder)} is missing"
+        )
+    run = prepare_run(config)
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     run.module.load_state_dict(state["state_dict"])
     run.module.scores = state["scores"]
@@ -163,8 +175,15 @@ def open_run(folder: str | Path) -> Run:
 
 
 def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | None:
-    """The checkpoint file to go on from; ``last`` is that of ``folder``, else of the scene's newest run
-    beside it.
+    """The checkpoint file to go on from.
+
+    Args:
+        ckpt_path: a file, or ``last``: that of ``folder``, else of the newest run beside it; None for none.
+        folder: of the run that is about to begin.
+        scene: its scene's name, for the error message.
+
+    Returns:
+        The file; None where nothing is resumed.
 
     Raises:
         UserError: there is none.
@@ -181,7 +200,8 @@ def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | N
     others = sorted(folder.parent.glob("*/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
     if not others:
         raise UserError(
-            f"ckpt_path=last: neither {folder} nor another run of '{scene}' beside it has checkpoints/last.ckpt"
+            f"ckpt_path=last: neither {folder} nor another run of '{scene}' beside it has "
+            "checkpoints/last.ckpt"
         )
     return others[-1]
 
@@ -197,8 +217,12 @@ def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     energy looks at twice the spots without gradients.
 
     Args:
+        plan: what the propagated field takes.
         n_voxels: of the volume.
         rays: of all spots of an iteration together.
+
+    Returns:
+        Bytes at the run's peak.
     """
     iterating = 72 * n_voxels + 120 * rays
     matching = 24 * n_voxels + 180 * rays

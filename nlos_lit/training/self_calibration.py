@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import lightning as L
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from nlos_lit.functional.sharded import leave_buffers
 from nlos_lit.metrics.transients import expected_deviance, nmse_noise_floor, poisson_deviance
-from nlos_lit.model.objective import Objective, adam, parameter_groups
+from nlos_lit.model.objective import Objective, parameter_groups, rated_groups
 from nlos_lit.model.pipeline import Pipeline
 
 log = logging.getLogger(__name__)
@@ -26,14 +26,10 @@ class SelfCalibration(L.LightningModule):
 
     Args:
         pipeline: the simulated measurement, its phasor field prepared (or by ``prepare``).
-        scale: counts that the loss counts as 1.
+        objective: what an iteration minimises.
         optimise: which of ``phasor``, ``sensor``, ``albedo`` are fitted; the others keep their start values.
+        optimizer: makes the optimiser of parameter groups with their rates, such as ``torch.optim.Adam``.
         rates: learning rate per group, on the unconstrained parameters.
-        lambda_sparsity, lambda_albedo: λ1 and λ2.
-        albedo_planes: depth planes in each iteration's E_ρ (a random batch of voxels, unbiased); None takes
-            all.
-        clip: largest joint gradient norm; None does not clip.
-        seed: of the batches of voxels.
         prepare: makes the phasor field once the processes that share it know each other; None where it is
             made.
     """
@@ -41,20 +37,15 @@ class SelfCalibration(L.LightningModule):
     def __init__(
         self,
         pipeline: Pipeline,
-        scale: float,
+        objective: Objective,
         *,
-        optimise: dict[str, bool],
-        rates: dict[str, float],
-        lambda_sparsity: float,
-        lambda_albedo: float,
-        albedo_planes: int | None = None,
-        clip: float | None = None,
-        seed: int = 0,
+        optimise: Mapping[str, bool],
+        optimizer: Callable[[list[dict[str, Any]]], torch.optim.Optimizer],
+        rates: Mapping[str, float],
         prepare: Callable[[], None] | None = None,
     ) -> None:
         super().__init__()
-        self.pipeline, self.scale, self.rates, self.clip = pipeline, scale, rates, clip
-        self.criterion = Objective(scale, lambda_sparsity, lambda_albedo, albedo_planes, seed)
+        self.pipeline, self.criterion, self.rates, self.make_optimizer = pipeline, objective, rates, optimizer
         self.optimised = [name for name in parameter_groups(pipeline) if optimise[name]]
         self.scores: dict[str, dict[str, float]] = {}
         self._prepare = prepare
@@ -121,11 +112,8 @@ class SelfCalibration(L.LightningModule):
         return self._finish_score()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
-        return adam(self.pipeline, self.rates, self.optimised)
-
-    def configure_gradient_clipping(self, optimizer: torch.optim.Optimizer, *_: Any, **__: Any) -> None:
-        if self.clip is not None:
-            self.clip_gradients(optimizer, gradient_clip_val=self.clip, gradient_clip_algorithm="norm")
+        """Of the groups that are optimised; Lightning calls it when the fit begins."""
+        return self.make_optimizer(rated_groups(self.pipeline, self.rates, self.optimised))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["scores"] = self.scores
@@ -164,7 +152,7 @@ class SelfCalibration(L.LightningModule):
         return {
             "nmse": error / energy,
             "nmse_noise_floor": floor / energy,
-            "mse": error / bins / self.scale**2,
+            "mse": error / bins / self.criterion.scale**2,
             "deviance_per_bin": deviance / bins,
             "deviance_noise": noise / bins,
         }

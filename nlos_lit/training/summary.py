@@ -42,6 +42,9 @@ def build_summary(
         seconds: (setup, one iteration, total).
         geometry: errors against truth; null where truth is not known.
         more: further entries, for example the mesh's report.
+
+    Returns:
+        What :func:`~nlos_lit.io.files.write_json` writes, with versions, git state and peak memory.
     """
     return {
         "scene": scene,
@@ -63,7 +66,7 @@ def build_summary(
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of Python, the project and the packages results depend on; None for one that is not installed."""
+    """Versions of Python, the project and the packages that results depend on; None: not installed."""
     found: dict[str, str | None] = {"python": platform.python_version(), "nlos_lit": nlos_lit.__version__}
     for name in PACKAGES:
         try:
@@ -74,8 +77,9 @@ def versions() -> dict[str, str | None]:
 
 
 def git_state(root: Path = ROOT) -> dict[str, Any] | None:
-    """``{"commit", "dirty"}`` of the checkout whose top is ``root`` (dirty: a tracked file differs); None
-    where there is none.
+    """``{"commit", "dirty"}`` of a checkout; dirty: a tracked file differs.
+
+    None where ``root`` is not the top of one.
     """
     top = _git(root, "rev-parse", "--show-toplevel")
     if top is None or Path(top).resolve() != Path(root).resolve():

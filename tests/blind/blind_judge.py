@@ -81,7 +81,8 @@ class Outcome:
 def pipeline_for(capture: Capture) -> BasePipeline:
     """Settings that follow from the capture's time window alone."""
     near, far = (length / 2 for length in capture.path_gate)
-    return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, PipelineSettings(0.1), SURFELS, 2 << 30)
+    model = PipelineSettings(0.1, wavelength_range=(2 / 3, 2.0))
+    return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, model, SURFELS, 2 << 30)
 
 
 def diagnose_file(

@@ -10,7 +10,7 @@ import torch
 from literal_scenes import CASES, NAMES, build
 
 from nlos_lit.functional.fixed_size_march import compact
-from nlos_lit.model.objective import Objective, adam
+from nlos_lit.model.objective import Objective, rated_groups
 
 RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}
 CRITERION = Objective(400.0, 0.01, 0.005, albedo_planes=5, seed=3)
@@ -83,7 +83,7 @@ def test_an_iteration_needs_no_value_on_the_host(monkeypatch):
     made.pipeline.geometry.wants_static = True
     loss_and_gradients(made)  # finds the capacity
     pipeline = made.pipeline.to("meta")
-    optimiser = adam(pipeline, RATES, list(RATES))
+    optimiser = torch.optim.Adam(rated_groups(pipeline, RATES, list(RATES)))
     made_on_host = torch.tensor
 
     def refuse(data, *args, device=None, **kwargs):

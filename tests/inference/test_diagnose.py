@@ -136,7 +136,7 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
         *SCENE,
         *small,
         "scene.name=two plates",
-        "trainer.threads=1",
+        "threads=1",
         "scene.iterations=1",
         "seed=3",
         folder=run,

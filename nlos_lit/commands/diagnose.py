@@ -1,0 +1,113 @@
+"""Say what the simulation gets wrong about a capture."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from data_modules.load import load_scene
+from nlos_lit.capture.errors import UserError
+from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.diagnose import diagnose as diagnose_capture
+from nlos_lit.model.build import PipelineSettings
+from nlos_lit.report.diagnosis_figures import diagnosis_figures
+from nlos_lit.report.page import log_figures, write_report
+from nlos_lit.report.verdict import verdict
+from nlos_lit.runtime.command_line import (
+    output_folder,
+    quote_numbers,
+    refuse_finished_folder,
+    stay_in_run,
+    write_config,
+)
+from nlos_lit.runtime.memory import parse_bytes
+from nlos_lit.runtime.progress import StepTicker
+from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.training.configs import register_settings, settings_of
+from nlos_lit.training.run_folder import Run, open_run
+
+log = logging.getLogger(__name__)
+
+
+def prepare(arguments: list[str]) -> None:
+    """What must be done before Hydra reads the command line ``arguments``, in place."""
+    quote_numbers(arguments)
+    refuse_finished_folder(arguments[1:], diagnosis=True)
+    stay_in_run(arguments)
+    register_settings()
+
+
+def diagnose(config: DictConfig) -> None:
+    """Diagnose a capture, or the one of a finished run, as ``conf/diagnose.yaml`` says, and write the report.
+
+    Raises:
+        UserError: the data or the settings cannot work, or there is a diagnosis already.
+    """
+    began = time.perf_counter()
+    folder = output_folder()
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    run = None
+    if config.run is None:
+        settings = write_config(config, folder)
+        scene, model = settings["scene"], settings["model"]
+        capture = load_scene(scene, settings["data_dir"], settings["seed"])[0]
+    else:
+        folder = Path(config.run)
+        run = _undiagnosed(folder)
+        settings = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
+        scene, model, capture = run.config["scene"], run.config["model"], run.capture
+    options = settings_of(CriticismSettings, settings["criticism"], "criticism")
+    pipeline = BasePipeline(
+        volume=scene["volume"],
+        model=settings_of(PipelineSettings, model, "model"),
+        surfels=settings_of(RefineSettings, settings["surfels"], "surfels"),
+        budget=parse_bytes(settings["memory_budget"]),
+    )
+    image = None
+    if run is not None:
+        with torch.no_grad():
+            image = run.module.pipeline.phasor().cpu(), run.module.pipeline.phasor.grid
+    kept = {
+        "scene": scene,
+        "model": model,
+        **{key: settings[key] for key in ("surfels", "criticism", "seed")},
+    }
+    try:
+        with StepTicker("diagnosis") as ticker:
+            diagnosis, _ = diagnose_capture(
+                capture,
+                pipeline,
+                options,
+                name=scene["name"],
+                seed=settings["seed"],
+                image=image,
+                folder=folder / "diagnosis",
+                settings=json.dumps(kept, indent=1, default=str),
+                report=ticker.step,
+            )
+    except KeyboardInterrupt:
+        log.warning("interrupted; the same command with hydra.run.dir=%s goes on where it was", folder)
+        sys.exit(130)
+    page = write_report(diagnosis, folder / "diagnosis")
+    shutil.rmtree(folder / "diagnosis" / "steps")
+    log_figures(folder, diagnosis_figures(diagnosis))
+    log.info("%s", verdict(diagnosis))
+    log.info("%.0f s; %s", time.perf_counter() - began, page)
+
+
+def _undiagnosed(folder: Path) -> Run:
+    if (folder / "diagnosis" / "diagnosis.json").exists():
+        raise UserError(
+            f"{folder} already holds a diagnosis; move {folder / 'diagnosis'} away to diagnose it anew"
+        )
+    return open_run(folder)

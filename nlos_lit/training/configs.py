@@ -1,0 +1,117 @@
+"""Configs as commands see them: classes state settings and their defaults, ``conf/*.yaml`` what differs.
+
+A settings class becomes the config group ``schema/NAME``, which ``conf/NAME/default.yaml`` takes over: types
+are checked and unknown keys refused when a command starts. Lightning's Trainer is stated by its signature.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import hydra
+import lightning as L
+from hydra.core.config_store import ConfigStore
+from omegaconf import OmegaConf
+
+from nlos_lit.capture.errors import UserError
+from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.model.build import PipelineSettings
+from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.training.instantiate import arguments_of
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+SETTINGS: dict[str, type] = {
+    "model": PipelineSettings,
+    "surfels": RefineSettings,
+    "criticism": CriticismSettings,
+}
+GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
+T = TypeVar("T")
+
+
+def register_settings() -> None:
+    """Make the groups ``schema/…`` known to Hydra; to be called before a config is composed."""
+    store = ConfigStore.instance()
+    for name, kind in SETTINGS.items():
+        node = OmegaConf.structured(kind)
+        OmegaConf.set_readonly(node, None)  # frozen is the object that is made of it, not the config
+        store.store(group="schema", name=name, node=node)
+    parameters = inspect.signature(L.Trainer.__init__).parameters.values()
+    trainer = {p.name: p.default for p in parameters if p.name not in GIVEN}
+    store.store(group="schema", name="trainer", node=trainer)
+
+
+def compose(command: str, overrides: Iterable[str] = ()) -> dict[str, Any]:
+    """The config that a command would run with, resolved, without starting it.
+
+    Args:
+        command: ``train``, ``diagnose`` or ``reconstruct``.
+        overrides: as on the command line, ``scene=su``.
+
+    Returns:
+        Plain containers.
+    """
+    register_settings()
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        config = hydra.compose(command, overrides=list(overrides))
+    return cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+
+
+def settings_of(kind: Callable[..., T], values: Mapping[str, Any], where: str, **given: Any) -> T:
+    """A settings object from a section of a config.
+
+    Args:
+        kind: its class.
+        values: the section.
+        where: the section's name, for error messages.
+        given: arguments that are not the config's.
+
+    Returns:
+        ``kind(**values, **given)``.
+
+    Raises:
+        UserError: the section holds a key that the class does not know, or lacks one.
+    """
+    accepted = [name for name in arguments_of(kind) or () if name not in given]
+    unknown = [name for name in values if name not in accepted]
+    if unknown:
+        raise UserError(f"{where} has no setting {unknown[0]!r}; there are {', '.join(accepted)}")
+    try:
+        return kind(**values, **given)
+    except TypeError as error:
+        raise UserError(f"{where} is incomplete: {error}") from error
+
+
+def run_config(folder: str | Path) -> dict[str, Any]:
+    """The resolved config that a run left in its folder.
+
+    Args:
+        folder: of the run.
+
+    Returns:
+        Plain containers with every section that opening the run reads.
+
+    Raises:
+        UserError: the folder is not a run's, or another version of the project wrote it.
+    """
+    file = Path(folder) / "config.yaml"
+    if not file.exists():
+        raise UserError(f"{folder} is not the folder of a finished run: {file.name} is missing")
+    config = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(file)))
+    missing = {"scene", "model", "objective", "optimizer", "surfels", "export"} - set(config)
+    unread = {
+        f"{name}.{key}"
+        for name in ("model", "surfels")
+        for key in set(config.get(name, ())) - {field.name for field in dataclasses.fields(SETTINGS[name])}
+    }
+    if missing or unread:
+        found = [*(f"no {name}" for name in sorted(missing)), *sorted(unread)]
+        raise UserError(
+            f"{file} was written by another version of this project and cannot be opened (it has "
+            f"{', '.join(found)}); train the scene again, or use the version that its summary.json names"
+        )
+    return config

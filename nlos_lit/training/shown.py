@@ -1,0 +1,119 @@
+"""What a run shows of itself: the transients of a few spots, the surface they see, figures of its state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from nlos_lit.capture import Capture
+from nlos_lit.functional.march import trilinear
+from nlos_lit.io.points import Points
+from nlos_lit.report import figures
+from nlos_lit.training.self_calibration import SelfCalibration
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+GOLDEN = 0.6180339887498949  # its multiples fill the unit interval evenly
+
+
+def shown_spots(n_spots: int, count: int) -> np.ndarray:
+    """Spots spread over the scan along a golden-ratio sequence: no row or column is favoured.
+
+    Args:
+        n_spots: S, of the scan.
+        count: how many are wanted, K.
+
+    Returns:
+        ``[K]`` rows of the capture in rising order, fewer where several fall on the same.
+
+    Examples:
+        >>> shown_spots(100, 3)
+        array([23, 61, 85])
+    """
+    return np.unique(((np.arange(1, count + 1) * GOLDEN) % 1.0 * n_spots).astype(np.int64))
+
+
+def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
+    """Where each spot is on the wall, for panels of transients.
+
+    Args:
+        capture: the measurement.
+        spots: ``[K]`` rows of it.
+
+    Returns:
+        K labels with x and y in m, of the laser points where one sensor point serves all spots.
+    """
+    scanned, name = (capture.laser, "laser") if capture.kind == "single_sensor" else (capture.sensor, "spot")
+    return [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
+
+
+@torch.no_grad()
+def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
+    """Figures of the present state of a run.
+
+    Args:
+        module: the run's, its phasor field prepared.
+        capture: what is fitted.
+        spots: ``[K]`` spots whose transients and surface are shown.
+
+    Returns:
+        ``volume``, ``albedo``, ``transients``, ``kernel``, ``laser_sensor`` and ``surface`` → figure.
+    """
+    pipeline = module.pipeline
+    index = torch.from_numpy(spots).to(module.device)
+    rendering = pipeline(index)
+    grid = pipeline.phasor.grid
+    volume, albedo = rendering.intensity.cpu().numpy(), rendering.albedo.cpu().numpy()
+    sensor = pipeline.laser_sensor
+    psi = sensor.kernel().cpu().numpy()
+    start = capture.path_gate[0]
+    path = start + (np.arange(rendering.expected.shape[1]) + 0.5) * capture.bin_length
+    measured = capture.gated_counts()[spots]
+    threshold = pipeline.geometry.threshold
+    return {
+        "volume": figures.volume_projections(volume, grid, threshold=threshold, title="intensity"),
+        "albedo": figures.albedo_projection(albedo, volume >= threshold, grid),
+        "transients": figures.transients_plot(
+            measured, rendering.expected.cpu().numpy(), path, spot_labels(capture, spots)
+        ),
+        "kernel": figures.kernel_plot(float(pipeline.phasor.omega_pf()), float(pipeline.phasor.sigma_pf())),
+        "laser_sensor": figures.laser_sensor_plot(
+            psi, capture.bin_length, first=-sensor.lead * capture.bin_length
+        ),
+        "surface": figures.surface_plot(surface_points(module, capture, spots)),
+    }
+
+
+@torch.no_grad()
+def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray, block: int = 16) -> Points:
+    """The surface seen from the scanned wall points of some spots.
+
+    Where one sensor point serves all spots, the laser points look in its stead: the volume can be seen from
+    anywhere.
+
+    Args:
+        module: the run's, its phasor field prepared.
+        capture: what is fitted.
+        spots: ``[K]`` rows of the capture.
+        block: spots at once.
+
+    Returns:
+        Points, normals and albedos in world coordinates, m.
+    """
+    pipeline = module.pipeline
+    volume = pipeline.phasor()
+    albedo = pipeline.albedo(volume)
+    end = "laser" if capture.kind == "single_sensor" else "sensor"
+    origins, normals = getattr(pipeline, end), getattr(pipeline, f"{end}_normal")
+    parts: list[tuple[np.ndarray, ...]] = []
+    for first in range(0, len(spots), block):
+        index = torch.from_numpy(spots[first : first + block]).to(module.device)
+        surface = pipeline.surface(volume, origins[index], normals[index])
+        values = trilinear(albedo, surface.point, pipeline.geometry.lattice)
+        parts.append(
+            tuple(t.cpu().numpy().astype(np.float64) for t in (surface.point, surface.normal, values))
+        )
+    return Points(*(np.concatenate(column) for column in zip(*parts, strict=True)))
