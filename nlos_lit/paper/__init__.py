@@ -1,3 +1,4 @@
-"""The paper's tables and figures, measured again: ``python results.py``. What each shows and on which data:
-docs/results.md.
+"""The paper's tables and figures, measured again: ``python results.py``.
+
+One module a table or figure; `experiments` lists them. What each shows and on which data: docs/results.md.
 """

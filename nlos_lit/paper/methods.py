@@ -1,10 +1,11 @@
-"""Surfaces of all systems on one capture: the classical ones with the best settings found by hand, ours as
-they come.
+"""Surfaces of all systems on one capture, and how they are scored and compared.
+
+The classical systems come with the best settings found with the truth in hand, ours as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import numpy as np
 from data_modules.simulate import Mesh
 from nlos_lit.baselines import reconstruct_directed
 from nlos_lit.baselines.surface import front_points
+from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.io.meshes import poisson_mesh
 from nlos_lit.io.points import Points, read_points
+from nlos_lit.io.tables import Row
 from nlos_lit.io.volumes import read_volume
 from nlos_lit.metrics.geometry import GeometryErrors, geometry_errors
-from nlos_lit.paper.record import CLASSICAL, Row
-from nlos_lit.paper.workspace import Scene
+from nlos_lit.paper.record import CLASSICAL, Glance
+from nlos_lit.paper.workspace import Arrays, Scene
 
 THRESHOLDS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
 FAINTEST = 0.2  # surfels below this share of the bright albedo are not drawn, meshed or scored
@@ -30,8 +33,15 @@ def possible(scene: Scene) -> list[str]:
 
 
 def options_of(method: str, scene: Scene, snrs: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Option sets to try: the falloff as the scene has it, the signal-to-noise parameter swept where there is
-    one.
+    """Option sets to try: the scene's falloff, and the signal-to-noise parameter swept where there is one.
+
+    Args:
+        method: one of `CLASSICAL`.
+        scene: whose falloff is taken.
+        snrs: signal-to-noise parameters of the light-cone transforms.
+
+    Returns:
+        keyword arguments of the method, one dict a set.
     """
     if method in ("lct", "dlct"):
         return [{"snr": snr, "falloff": scene.falloff} for snr in snrs]
@@ -39,10 +49,12 @@ def options_of(method: str, scene: Scene, snrs: tuple[float, ...]) -> list[dict[
 
 
 def classical_points(scene: Scene, method: str, snrs: tuple[float, ...]) -> tuple[Points, dict[str, float]]:
-    """A method's surface at its best: of all option sets and thresholds the one with the highest F-score
-    against the truth.
+    """A method's surface at its best: the option set and threshold with the highest F-score.
 
-    The F-score is the harmonic mean of coverage and of the share of points near the truth.
+    Args:
+        scene: capture, volume and truth.
+        method: one of `CLASSICAL`.
+        snrs: signal-to-noise parameters that the light-cone transforms try.
 
     Returns:
         the points, and the threshold and options that were best.
@@ -57,14 +69,27 @@ def classical_points(scene: Scene, method: str, snrs: tuple[float, ...]) -> tupl
             score = f_score(errors_of(points, scene))
             if best is None or score > best[0]:
                 best = score, points, {"threshold": threshold, **options}
+    assert best is not None
     return best[1], best[2]
 
 
+def known_truth(scene: Scene) -> SurfaceTruth:
+    """The true surface of a scene that was simulated or rendered, and so has one."""
+    assert scene.truth is not None
+    return scene.truth
+
+
 def errors_of(points: Points, scene: Scene) -> GeometryErrors:
-    """Errors against the first surface along z; points and truth are near each other within 2 cm in depth and
-    one spot spacing.
+    """Errors against the first true surface along z.
+
+    Args:
+        points: a reconstruction.
+        scene: whose truth is known.
+
+    Returns:
+        the errors; points and truth are near each other within 2 cm in depth and one spot spacing sideways.
     """
-    return geometry_errors(points, scene.truth, lateral_tolerance=scene.spacing)
+    return geometry_errors(points, known_truth(scene), lateral_tolerance=scene.spacing)
 
 
 def f_score(errors: GeometryErrors) -> float:
@@ -74,7 +99,15 @@ def f_score(errors: GeometryErrors) -> float:
 
 
 def run_points(folder: Path, refined: bool) -> Points:
-    """The surface of a training: all of the phasor surface's points, or the surfels that are not faint."""
+    """The surface of a training.
+
+    Args:
+        folder: of the finished run.
+        refined: take the surfels that are not faint, instead of all points of the phasor surface.
+
+    Returns:
+        points, m, in the world frame.
+    """
     if not refined:
         return read_points(folder / "points.ply")
     points = read_points(folder / "refined" / "points.ply")
@@ -82,7 +115,15 @@ def run_points(folder: Path, refined: bool) -> Points:
 
 
 def front_of_run(folder: Path, scene: Scene) -> Points:
-    """The maximum along z of a training's volume, as of the classical methods, at the scene's own threshold."""
+    """The maximum along z of a training's volume, taken as it is from the classical methods.
+
+    Args:
+        folder: of the finished run.
+        scene: whose own threshold is taken.
+
+    Returns:
+        points, m, in the world frame.
+    """
     volume, grid, _ = read_volume(folder / "volume.h5")
     return front_points(volume, grid, scene.threshold)
 
@@ -97,15 +138,33 @@ OURS: dict[str, tuple[str, Callable[[Path, Scene], Points]]] = {
 
 
 def selected(points: Points, keep: np.ndarray) -> Points:
-    """The points of a mask ``[N]``."""
+    """Some of the points.
+
+    Args:
+        points: N of them.
+        keep: ``[N]`` True for those that stay.
+
+    Returns:
+        the points kept, in the same order.
+    """
     intensity = None if points.intensity is None else points.intensity[keep]
     return Points(points.positions[keep], points.normals[keep], points.albedo[keep], intensity)
 
 
 def mesh_of(points: Points, depth: int = 7) -> Mesh | None:
-    """Poisson reconstruction; None where the points do not suffice."""
+    """Poisson reconstruction of a surface.
+
+    Args:
+        points: with normals.
+        depth: of the octree, see `poisson_mesh`.
+
+    Returns:
+        the mesh, with albedo 1; None where the points do not suffice.
+    """
     mesh, _ = poisson_mesh(points, depth)
-    return None if mesh is None else Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), 1.0)
+    if mesh is None:
+        return None
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), np.asarray(1.0))
 
 
 def geometry_row(errors: GeometryErrors) -> Row:
@@ -120,8 +179,71 @@ def geometry_row(errors: GeometryErrors) -> Row:
     }
 
 
+def to_keep(row: Mapping[str, float], chosen: Mapping[str, float] | None = None) -> dict[str, Any]:
+    """A row as named numbers that `Workspace.kept` stores beside arrays; `kept_row` reads it back.
+
+    Args:
+        row: column → number.
+        chosen: options that were chosen with the truth in hand.
+
+    Returns:
+        the same under names that say which is which.
+    """
+    return {f"row_{key}": value for key, value in row.items()} | {
+        f"chosen_{key}": value for key, value in (chosen or {}).items()
+    }
+
+
+def kept_row(entry: Arrays) -> Row:
+    """The row that `to_keep` stored among other arrays.
+
+    Examples:
+        >>> stored = to_keep({"coverage": 0.5}, {"snr": 0.1})
+        >>> kept_row({name: np.array(value) for name, value in stored.items()})
+        {'coverage': 0.5}
+    """
+    return {key.removeprefix("row_"): float(v) for key, v in entry.items() if key.startswith("row_")}
+
+
+def kept_choice(entry: Arrays) -> str | None:
+    """Options chosen with the truth in hand that `to_keep` stored, in words; None where there are none.
+
+    Examples:
+        >>> kept_choice({"chosen_threshold": np.array(0.2), "chosen_snr": np.array(0.01)})
+        'threshold 0.2, snr 0.01'
+    """
+    chosen = {key.removeprefix("chosen_"): float(v) for key, v in entry.items() if key.startswith("chosen_")}
+    return ", ".join(f"{key} {value:.3g}" for key, value in chosen.items()) or None
+
+
+def glance_of(what: str, data: str, value: Mapping[str, float], higher: bool = False) -> Glance:
+    """The comparison of all systems in one quantity.
+
+    Args:
+        what: the quantity with its unit.
+        data: the capture.
+        value: system → value, the systems named as in `CLASSICAL` and `OURS`.
+        higher: more is better.
+
+    Returns:
+        the comparison; systems without a value are left out.
+    """
+    classical = {name: v for name, v in value.items() if name in CLASSICAL}
+    ours = value["ours, phasor surface"], value["ours, refined"]
+    return Glance(what, data, value.get("published system"), classical, *ours, higher)
+
+
 def front_of_points(points: Points, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """``[nx, ny]`` albedo of the points summed over each cell of a lattice."""
+    """Albedo of the points summed over each cell of a lattice, seen from the wall.
+
+    Args:
+        points: a surface.
+        x: ``[nx]`` centres of the cells, evenly spaced, m.
+        y: ``[ny]`` the same along y.
+
+    Returns:
+        ``[nx, ny]``, 0 where there are no points.
+    """
     place = [
         np.floor((points.positions[:, k] - axis[0]) / (axis[1] - axis[0]) + 0.5).astype(int)
         for k, axis in enumerate((x, y))

@@ -1,5 +1,6 @@
-"""The generated parts of docs/results.md, from stored experiments; what stands between them is written by
-hand and kept.
+"""The generated parts of docs/results.md, from stored experiments.
+
+What stands between the generated parts is written by hand and kept.
 """
 
 from __future__ import annotations
@@ -37,8 +38,11 @@ END = "<!-- end -->"
 
 
 def update_page(page: Path, results: Path) -> list[str]:
-    """Rewrite the generated parts whose experiments are stored below ``results``; copy their figures and
-    tables beside the page.
+    """Rewrite the generated parts whose experiments are stored; copy figures and tables beside the page.
+
+    Args:
+        page: docs/results.md, or a copy.
+        results: folder that holds a folder an experiment.
 
     Returns:
         the experiments that were written.
@@ -65,10 +69,25 @@ def update_page(page: Path, results: Path) -> list[str]:
 
 
 def replace_part(text: str, name: str, content: str) -> str:
-    """``text`` with what stands between the marks of ``name`` exchanged.
+    """A page with one generated part exchanged.
+
+    Args:
+        text: of the page.
+        name: of the part.
+        content: what comes between the part's marks.
+
+    Returns:
+        the page's new text.
 
     Raises:
         UserError: the marks are not there, once.
+
+    Examples:
+        >>> print(replace_part("\\n".join(["by hand", begin("a"), "old", END]), "a", "new"))
+        by hand
+        <!-- generated: a -->
+        new
+        <!-- end -->
     """
     pattern = re.compile(re.escape(begin(name)) + r"\n.*?" + re.escape(END), re.DOTALL)
     if len(pattern.findall(text)) != 1:
@@ -77,7 +96,15 @@ def replace_part(text: str, name: str, content: str) -> str:
 
 
 def section(name: str, record: dict[str, Any]) -> str:
-    """Command, data, table and figures of one experiment."""
+    """Command, data, table and figures of one experiment, as Markdown.
+
+    Args:
+        name: of the experiment.
+        record: what `read_record` found.
+
+    Returns:
+        the lines between the experiment's marks.
+    """
     lines = [
         f"    python results.py {name}",
         "",
@@ -101,7 +128,13 @@ def glance(records: dict[str, dict[str, Any]]) -> str:
 
 
 def copy_files(folder: Path, docs: Path, record: dict[str, Any]) -> None:
-    """A record's figures into ``docs/images`` and its table into ``docs/results``."""
+    """A record's figures into ``docs/images`` and its table into ``docs/results``.
+
+    Args:
+        folder: of the experiment.
+        docs: folder of the page.
+        record: what `read_record` found there.
+    """
     for place in (docs / "images", docs / "results"):
         place.mkdir(exist_ok=True)
     for figure in record["captions"]:

@@ -1,13 +1,16 @@
-"""Figures of the experiments, in the style of :mod:`nlos_lit.report.figures`. Functions take results and
-return figures.
+"""How the paper's figures are drawn, in the style of `nlos_lit.report.style`.
+
+Functions take results and return figures; they compute nothing beyond scaling.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from nlos_lit.report.style import (
@@ -22,6 +25,7 @@ from nlos_lit.report.style import (
     RED,
     SKY,
     SYMBOLS,
+    lattice_image,
     styled,
 )
 
@@ -54,7 +58,15 @@ class Panel:
 
 @styled
 def lines(panels: Sequence[Panel], columns: int = 3) -> Figure:
-    """Lines with markers, one colour a system through all panels, one legend."""
+    """Lines with markers, one colour a system through all panels, one legend.
+
+    Args:
+        panels: at least one, drawn row by row.
+        columns: panels a row, at most.
+
+    Returns:
+        the figure.
+    """
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.8 * columns, 0.5 + 2.9 * rows))
@@ -86,7 +98,17 @@ def lines(panels: Sequence[Panel], columns: int = 3) -> Figure:
 def dots(
     rows: Sequence[str], groups: Mapping[str, Sequence[Sequence[float]]], xlabel: str, title: str
 ) -> Figure:
-    """Values of each row on a logarithmic axis, one mark a value, groups side by side: group → row → values."""
+    """Values of each row on a logarithmic axis, one mark a value, groups side by side.
+
+    Args:
+        rows: R labels, from the top.
+        groups: label of a group (at most four) → R lists of positive values.
+        xlabel: quantity and unit.
+        title: of the figure.
+
+    Returns:
+        the figure.
+    """
     figure = Figure(figsize=(7, 0.9 + 0.38 * len(rows)))
     axes = figure.subplots()
     shift = 0.24 / max(1, len(groups) - 1)
@@ -121,6 +143,25 @@ class Image:
     note: str = ""
 
 
+def limits_of(values: np.ndarray, low: float = 0.01, high: float = 0.99) -> tuple[float, float]:
+    """Ends of a colour scale that leave the extremes out.
+
+    Args:
+        values: any shape; NaN counts for nothing.
+        low: share of the values below the lower end.
+        high: share of the values below the upper end.
+
+    Returns:
+        ``(lower, upper)``.
+
+    Examples:
+        >>> limits_of(np.array([0.0, 1.0, 2.0, np.nan]), 0.25, 0.75)
+        (0.5, 1.5)
+    """
+    ends = np.nanquantile(values, (low, high))
+    return float(ends[0]), float(ends[1])
+
+
 @styled
 def images(
     grid: Sequence[Sequence[Image | None]],
@@ -129,8 +170,17 @@ def images(
     extent: Sequence[tuple[float, float, float, float]],
     side: float = 1.75,
 ) -> Figure:
-    """Front views from the wall (+x to the left) in rows and columns; ``extent`` (x0, x1, y0, y1) in m of
-    each row.
+    """Front views from the wall (+x to the left) in rows and columns.
+
+    Args:
+        grid: R rows of C images; None for one that cannot be.
+        rows: R labels.
+        columns: C labels.
+        extent: ``(x0, x1, y0, y1)`` of each row's images, m.
+        side: width of an image, inches.
+
+    Returns:
+        the figure; a row of depths has one colour bar.
     """
     figure = Figure(figsize=(1.2 + (side + 0.1) * len(columns), 0.4 + side * len(rows)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False)
@@ -147,24 +197,19 @@ def images(
                 axes.text(0.5, 0.5, "–", transform=axes.transAxes, ha="center", va="center")
                 axes.set_box_aspect((extent[i][3] - extent[i][2]) / (extent[i][1] - extent[i][0]))
                 continue
-            drawn = axes.imshow(
-                np.swapaxes(image.values, 0, 1),
-                extent=extent[i],
-                origin="lower",
-                aspect="equal",
-                **_scale(image),
-            )
+            drawn = lattice_image(axes, image.values, extent[i][:2], extent[i][2:], **_scale(image))
             axes.invert_xaxis()
             shown[image.kind] = drawn
             if image.note:
-                axes.text(0.03, 0.03, image.note, transform=axes.transAxes, fontsize="x-small", color="white", va="bottom",
-                          bbox={"facecolor": "black", "alpha": 0.55, "pad": 1.2, "linewidth": 0})  # fmt: skip
+                box = {"facecolor": "black", "alpha": 0.55, "pad": 1.2, "linewidth": 0}
+                text = {"transform": axes.transAxes, "fontsize": "x-small", "color": "white", "va": "bottom"}
+                axes.text(0.03, 0.03, image.note, bbox=box, **text)
         if "depth" in shown:
             figure.colorbar(shown["depth"], ax=panels[i, -1], label="z (m)", shrink=0.85)
     return figure
 
 
-def _scale(image: Image) -> dict:
+def _scale(image: Image) -> dict[str, Any]:
     known = image.values[np.isfinite(image.values)]
     if image.kind == "rgb":
         return {}
@@ -192,7 +237,17 @@ def convergence(
 ) -> Figure:
     """Imaging parameters over the iterations, the virtual illumination before and after, one transient.
 
-    ``kernels``: label → (Ω_pf rad/m, σ_pf m); ``transients``: label → (path m, counts a bin).
+    Args:
+        track: name → value after each iteration, for six parameters.
+        units: name → unit.
+        truth: name → true value, where it is known.
+        kernels: label → (Ω_pf in rad/m, σ_pf in m), first and final.
+        transients: label that begins with measured, first or final → (path ``[T]`` in m, counts a bin
+            ``[T]``).
+        title: of the figure.
+
+    Returns:
+        the figure.
     """
     figure = Figure(figsize=(13.5, 5.6))
     panels = figure.subplots(2, 4)
@@ -216,7 +271,7 @@ def convergence(
     return figure
 
 
-def _kernels(axes, kernels: Mapping[str, tuple[float, float]]) -> None:
+def _kernels(axes: Axes, kernels: Mapping[str, tuple[float, float]]) -> None:
     reach = 3 * max(sigma for _, sigma in kernels.values())
     t = np.linspace(-reach, reach, 801)
     for (label, (omega, sigma)), colour in zip(kernels.items(), (SKY, RED), strict=False):
@@ -233,20 +288,24 @@ def progress(
     transients: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
     extent: tuple[float, float, float, float],
 ) -> Figure:
-    """Volume, surface, kernel and a transient (path, measured, rendered) in rows, states of a training in
-    columns.
+    """Volume, surface, kernel and a transient in rows, states of a training in columns.
+
+    Args:
+        labels: C states.
+        volumes: C front views of the volume.
+        depths: C depth maps.
+        kernels: C of (Ω_pf in rad/m, σ_pf in m).
+        transients: C of (path in m, measured, rendered counts a bin), ``[T]`` each.
+        extent: ``(x0, x1, y0, y1)`` of the images, m.
+
+    Returns:
+        the figure.
     """
     figure = Figure(figsize=(0.5 + 2.6 * len(labels), 9.2))
     panels = figure.subplots(4, len(labels), squeeze=False)
     for j, label in enumerate(labels):
         for i, image in enumerate((volumes[j], depths[j])):
-            drawn = panels[i, j].imshow(
-                np.swapaxes(image.values, 0, 1),
-                extent=extent,
-                origin="lower",
-                aspect="equal",
-                **_scale(image),
-            )
+            drawn = lattice_image(panels[i, j], image.values, extent[:2], extent[2:], **_scale(image))
             panels[i, j].set(xticks=[], yticks=[], facecolor=NOTHING)
             panels[i, j].invert_xaxis()
             if i == 1 and j == len(labels) - 1:
@@ -271,8 +330,16 @@ def clouds(
     columns: Sequence[str],
     limit: float,
 ) -> Figure:
-    """Points ``[N, 3]`` from the wall coloured by a distance ``[N]`` (m), in rows and columns; ``limit`` in m
-    is the darkest.
+    """Points from the wall coloured by a distance, in rows and columns.
+
+    Args:
+        grid: R rows of C clouds, each points ``[N, 3]`` and distance ``[N]``, m; None for one that cannot be.
+        rows: R labels.
+        columns: C labels.
+        limit: distance of the darkest colour, m.
+
+    Returns:
+        the figure.
     """
     figure = Figure(figsize=(1.1 + 1.75 * len(columns), 0.5 + 1.9 * len(rows)))
     panels = figure.subplots(len(rows), len(columns), squeeze=False, sharex="row", sharey="row")
@@ -290,10 +357,9 @@ def clouds(
                 continue
             points, distance = cloud
             order = np.argsort(-points[:, 2])
-            drawn = axes.scatter(
-                points[order, 0], points[order, 1], c=1e3 * distance[order], cmap="magma_r", vmin=0, vmax=1e3 * limit, s=1.2,
-                linewidths=0, rasterized=True,
-            )  # fmt: skip
+            colours = {"c": 1e3 * distance[order], "cmap": "magma_r", "vmin": 0, "vmax": 1e3 * limit}
+            x, y = points[order, :2].T
+            drawn = axes.scatter(x, y, s=1.2, linewidths=0, rasterized=True, **colours)
         panels[i, 0].set_xlim(*panels[i, 0].get_xlim()[::-1])
     if drawn is not None:
         figure.colorbar(

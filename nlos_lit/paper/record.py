@@ -40,8 +40,9 @@ class Glance:
     higher: bool = False
 
     def row(self) -> Row:
-        """The comparison as a row of a table; the verdict compares the better of ours with the better of the
-        others.
+        """The comparison as a row of a table.
+
+        The verdict compares the better of ours with the better of the others.
         """
         known = {name: value for name, value in self.classical.items() if _known(value)}
         sign = -1 if self.higher else 1
@@ -68,7 +69,22 @@ def _known(value: float | None) -> TypeGuard[float]:
 
 
 def compare(mine: float, rival: float, higher: bool) -> str:
-    """How much better ``mine`` is than ``rival``, in words."""
+    """How much better one value is than another, in words.
+
+    Args:
+        mine: ours.
+        rival: theirs.
+        higher: more is better.
+
+    Returns:
+        the verdict as Markdown; – where a value is not positive.
+
+    Examples:
+        >>> compare(2.0, 8.0, higher=False)
+        '**better**, 4 ×'
+        >>> compare(0.5, 0.8, higher=True)
+        'worse, 1.6 ×'
+    """
     if mine <= 0 or rival <= 0:
         return "–"
     factor = mine / rival if higher else rival / mine

@@ -1,5 +1,6 @@
-"""The captures that experiments work on: simulated, rendered, or real; thinned or drawn anew where an
-experiment asks for it.
+"""The captures that experiments work on: simulated, rendered, or real.
+
+They are thinned or drawn anew where an experiment asks for it.
 """
 
 from __future__ import annotations
@@ -61,27 +62,63 @@ class Size:
 
 SIZES = {
     "full": Size(
-        name="full", experiment="evidence", real=True, seeds=(0, 1, 2), counts=(50, 200, 800, 3200, 12800),
-        minutes=(10, 30, 60, 180), steps=(0, 10, 50, 100), snrs=(0.001, 0.01, 0.1, 1.0, 10.0),
-        effects=(("wall_reflectance", "ambient_map", "afterpulsing"),), samples=20_000,
+        name="full",
+        experiment="evidence",
+        real=True,
+        seeds=(0, 1, 2),
+        counts=(50, 200, 800, 3200, 12800),
+        minutes=(10, 30, 60, 180),
+        steps=(0, 10, 50, 100),
+        snrs=(0.001, 0.01, 0.1, 1.0, 10.0),
+        effects=(("wall_reflectance", "ambient_map", "afterpulsing"),),
+        samples=20_000,
     ),
     "reduced": Size(
-        name="reduced", experiment="evidence_reduced", real=False, seeds=(0,), counts=(400, 4000), minutes=(60, 180),
-        steps=(0, 2, 4), snrs=(0.01, 1.0), effects=(("vignetting",),), samples=2_000,
+        name="reduced",
+        experiment="evidence_reduced",
+        real=False,
+        seeds=(0,),
+        counts=(400, 4000),
+        minutes=(60, 180),
+        steps=(0, 2, 4),
+        snrs=(0.01, 1.0),
+        effects=(("vignetting",),),
+        samples=2_000,
     ),
-}  # fmt: skip
+}
 
 
 def sensor_of(bin_length: float, counts: float) -> SensorModel:
-    """Response of every simulated capture: σ 1 bin, κ 0.6 a bin; background in proportion to the counts."""
+    """Response of every simulated capture: σ 1 bin, κ 0.6 a bin; background in proportion to the counts.
+
+    Args:
+        bin_length: optical path of one bin, m.
+        counts: mean third-bounce counts a spot.
+
+    Returns:
+        the sensor.
+
+    Examples:
+        >>> sensor_of(0.01, 5000.0)
+        SensorModel(sigma=0.01, kappa=60.0, background=0.15, mean_counts=5000.0, direct_counts=0.0)
+    """
     return SensorModel(
         sigma=bin_length, kappa=0.6 / bin_length, background=BACKGROUND * counts, mean_counts=counts
     )
 
 
 def bunny(work: Workspace, size: Size) -> Subject:
-    """The paper's two-albedo bunny by the own simulator; reduced: the sphere before the plate, in two
-    albedos.
+    """The paper's two-albedo bunny by the own simulator; reduced: the sphere before the plate.
+
+    Args:
+        work: where captures are kept; the full size needs the bunny's mesh in its data.
+        size: of the experiments.
+
+    Returns:
+        the subject, its capture made where it was not there.
+
+    Raises:
+        UserError: the mesh is not there.
     """
     if size.real:
         scan = ScanPlan(nx=64, ny=64, width=2.0, bin_length=0.006, n_bins=512, t_start=1.8)
@@ -93,7 +130,19 @@ def bunny(work: Workspace, size: Size) -> Subject:
 
 
 def noisy_bunny(work: Workspace, size: Size, counts: int) -> Subject:
-    """The same scene on a quarter of the spots, at another exposure."""
+    """The bunny on a quarter of the spots, at another exposure.
+
+    Args:
+        work: as of `bunny`.
+        size: of the experiments.
+        counts: mean third-bounce counts a spot.
+
+    Returns:
+        the subject.
+
+    Raises:
+        UserError: the mesh is not there.
+    """
     if size.real:
         scan = ScanPlan(nx=32, ny=32, width=2.0, bin_length=0.006, n_bins=512, t_start=1.8)
         label = f"bunny, own simulator, 32×32 spots over 2 m, {counts} counts a spot"
@@ -107,7 +156,18 @@ def noisy_bunny(work: Workspace, size: Size, counts: int) -> Subject:
 
 
 def with_geometry(work: Workspace, size: Size) -> list[Subject]:
-    """Independent renders with known surfaces; reduced: none."""
+    """Independent renders with known surfaces; reduced: none.
+
+    Args:
+        work: where captures are kept; its data hold the renders and their meshes.
+        size: of the experiments.
+
+    Returns:
+        the subjects.
+
+    Raises:
+        UserError: a render or mesh is not there.
+    """
     if not size.real:
         return []
     return [
@@ -126,8 +186,21 @@ def with_geometry(work: Workspace, size: Size) -> list[Subject]:
 
 
 def exposed(work: Workspace, size: Size, minutes: int) -> Subject:
-    """SU (reduced: the simulated letters), its counts thinned binomially to a shorter exposure."""
+    """SU (reduced: the simulated letters), its counts thinned binomially to a shorter exposure.
+
+    Args:
+        work: where captures are kept; the full size needs SU's file in its data.
+        size: of the experiments.
+        minutes: exposure, out of those of the size.
+
+    Returns:
+        the subject; at the last of the size's exposures the whole file.
+
+    Raises:
+        UserError: the file is not there.
+    """
     share = minutes / size.minutes[-1]
+    settings: tuple[str, ...]
     if size.real:
         source, label = work.needed("data_s_u.mat"), "SU, real, 64×64 spots, bins of 16 ps"
         settings = ("scene=su", "scene.iterations=100")
@@ -136,7 +209,7 @@ def exposed(work: Workspace, size: Size, minutes: int) -> Subject:
         plain = _simulated(
             work, "letters", "letters, 16×16", SCENES["letters"](), scan, 3000.0, (0.4, 1.1, 0.02), 0.2
         )
-        source, label, settings = work.path("captures/letters.hdf5"), plain.label, tuple(plain.overrides)
+        source, label, settings = work.path("captures/letters.hdf5"), plain.label, plain.overrides
     settings = tuple(item for item in settings if not item.startswith("scene.path="))
     if share == 1:
         return Subject(f"exposure_{minutes}", label, (*settings, f"scene.path={source.resolve()}"))
@@ -151,7 +224,18 @@ def exposed(work: Workspace, size: Size, minutes: int) -> Subject:
 
 
 def real_scenes(work: Workspace, size: Size) -> list[Subject]:
-    """Captures of real scenes; reduced: the stand-in for SU."""
+    """Captures of real scenes; reduced: the stand-in for SU.
+
+    Args:
+        work: where captures are kept; the full size needs the files in its data.
+        size: of the experiments.
+
+    Returns:
+        the subjects.
+
+    Raises:
+        UserError: a file is not there.
+    """
     scenes = [exposed(work, size, size.minutes[-1])]
     if size.real:
         for name, file, label in (
@@ -164,8 +248,17 @@ def real_scenes(work: Workspace, size: Size) -> list[Subject]:
 
 
 def thinned(capture: Capture, share: float, seed: int) -> Capture:
-    """Every photon kept with probability ``share``: what a shorter exposure would have counted, where nothing
-    saturates.
+    """A capture of which every photon is kept with the same probability.
+
+    This is what a shorter exposure would have counted, where nothing saturates.
+
+    Args:
+        capture: photon counts.
+        share: probability to keep a photon, in [0, 1].
+        seed: of the draw.
+
+    Returns:
+        the capture with fewer counts; its provenance says so.
     """
     counts = np.random.default_rng(seed).binomial(capture.counts.astype(np.int64), share)
     steps = [*capture.provenance.get("steps", []), f"thinned binomially to {share:.4g}, seed {seed}"]
@@ -194,9 +287,13 @@ def _settings(path: Path, depth: tuple[float, float, float], threshold: float) -
     truth = path.with_name(f"{path.stem}_truth.h5")
     near, far, pitch = depth
     return (
-        "scene=capture", f"scene.path={path.resolve()}", f"scene.truth={truth.resolve()}", f"scene.volume.depth=[{near},{far}]",
-        f"scene.volume.depth_pitch={pitch}", f"scene.threshold={threshold}",
-    )  # fmt: skip
+        "scene=capture",
+        f"scene.path={path.resolve()}",
+        f"scene.truth={truth.resolve()}",
+        f"scene.volume.depth=[{near},{far}]",
+        f"scene.volume.depth_pitch={pitch}",
+        f"scene.threshold={threshold}",
+    )
 
 
 def _simulated(
@@ -228,6 +325,7 @@ def _rendered(
     """An expected-value render as a measurement: response, exposure, background, Poisson counts."""
     path = work.path(f"captures/{name}.hdf5")
     source = read_capture(work.needed(f"{file}.hdf5"))
+    assert source.scan_shape is not None
     spots = "×".join(map(str, source.scan_shape))
     label = (
         f"{name.split('_')[0]}, path-traced render, {source.kind}, {spots} spots, {counts:.0f} counts a spot"

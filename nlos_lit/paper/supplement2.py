@@ -1,12 +1,14 @@
-"""The supplement's Figure 2: how the imaging parameters converge."""
+"""The supplement's Figure 2: states of one training at several iterations."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from nlos_lit.paper import plots
+from nlos_lit.paper.methods import kept_row, known_truth
 from nlos_lit.paper.record import Evidence
 from nlos_lit.paper.subjects import Size, bunny
 from nlos_lit.paper.trainings import VISIBLE, full_model, state_at, summary
@@ -14,18 +16,26 @@ from nlos_lit.paper.workspace import Workspace
 
 
 def supplement2(work: Workspace, size: Size) -> Evidence:
-    """States of one training at several iterations."""
+    """States of one training at several iterations.
+
+    Args:
+        work: where captures, trainings and states are kept.
+        size: of the experiments; its ``steps`` are the iterations.
+
+    Returns:
+        a row a state, and one figure.
+    """
     subject = bunny(work, size)
     last = full_model(work, size)
     folders: dict[int, Path] = {}
     for steps in size.steps[1:-1]:
         start = folders[max(folders)] if folders else None
-        folders[steps] = work.train(f"bunny_after_{steps}", subject, "ablation=all", f"seed={size.seeds[0]}",
-                                    f"scene.iterations={steps}", start=start)  # fmt: skip
+        settings = ["ablation=all", f"seed={size.seeds[0]}", f"scene.iterations={steps}"]
+        folders[steps] = work.train(f"bunny_after_{steps}", subject, *settings, start=start)
     folders[size.steps[-1]] = last
-    states = [work.kept("supplement2/0", lambda: state_at(last, "first"))]
+    states = [work.kept("supplement2/0", partial(state_at, last, "first"))]
     states += [
-        work.kept(f"supplement2/{steps}", lambda f=folder: state_at(f, "final"))
+        work.kept(f"supplement2/{steps}", partial(state_at, folder, "final"))
         for steps, folder in folders.items()
     ]
     nmse = [
@@ -33,13 +43,17 @@ def supplement2(work: Workspace, size: Size) -> Evidence:
         *(summary(f)["heldout"]["nmse"]["final"] for f in folders.values()),
     ]
     rows = [
-        {"iteration": steps, "held-out NMSE": error, "λ (cm)": 200 * np.pi / float(s["omega_pf"]),
-         "σ_pf (cm)": 100 * float(s["sigma_pf"]),
-         **{k.removeprefix("row_"): float(v) for k, v in s.items() if k.startswith("row_")}}
-        for steps, error, s in zip(size.steps, nmse, states, strict=True)
-    ]  # fmt: skip
+        {
+            "iteration": steps,
+            "held-out NMSE": error,
+            "λ (cm)": 200 * np.pi / float(state["omega_pf"]),
+            "σ_pf (cm)": 100 * float(state["sigma_pf"]),
+            **kept_row(state),
+        }
+        for steps, error, state in zip(size.steps, nmse, states, strict=True)
+    ]
     scene = work.open(subject)
-    limits = tuple(np.nanquantile(scene.truth.depth, (0.01, 0.99)))
+    limits = plots.limits_of(known_truth(scene).depth)
     shown = plots.progress(
         [f"iteration {steps}" for steps in size.steps],
         [plots.Image(s["front"]) for s in states],
@@ -51,11 +65,13 @@ def supplement2(work: Workspace, size: Size) -> Evidence:
     return Evidence(
         "supplement2",
         "Supplement Figure 2: progress of the optimisation",
-        "Erato and Dragon at 0, 10, 50 and 100 iterations: after 50 very close to the converged result. Pictures only.",
+        "Erato and Dragon at 0, 10, 50 and 100 iterations: after 50 very close to the converged result. "
+        "Pictures only.",
         f"{subject.label}; the surface as seen from {VISIBLE} wall points.",
         rows,
         {"progress": shown},
         {
-            "progress": "Maximum of the volume along z, depth (m), virtual illumination, and the brightest held-out transient."
+            "progress": "Maximum of the volume along z, depth (m), virtual illumination, and the brightest "
+            "held-out transient."
         },
     )

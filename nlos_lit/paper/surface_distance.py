@@ -25,8 +25,13 @@ class Distances:
     from_truth: np.ndarray
 
     def summary(self, tolerance: float) -> dict[str, float]:
-        """RMSE, largest and 95th percentile in mm both ways; share of the truth nearer than ``tolerance``
-        (m).
+        """RMSE, largest and 95th percentile in mm both ways; share of the truth nearer than a tolerance.
+
+        Args:
+            tolerance: m.
+
+        Returns:
+            column → value; NaN and 0 where there is no reconstruction.
         """
         entries = {}
         for name, values in (("surface→truth", self.to_truth), ("truth→surface", self.from_truth)):
@@ -39,7 +44,16 @@ class Distances:
 
 
 def sample(mesh: Mesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """``[count, 3]`` points spread evenly over a mesh's area, and ``[count]`` the face of each."""
+    """Points spread evenly over a mesh's area.
+
+    Args:
+        mesh: with some area.
+        count: number of points.
+        seed: of the draw.
+
+    Returns:
+        ``[count, 3]`` points, m, and ``[count]`` the face of each.
+    """
     rng = np.random.default_rng(seed)
     area = np.linalg.norm(mesh.face_vectors, axis=1)
     face = rng.choice(len(area), count, p=area / area.sum())
@@ -51,8 +65,17 @@ def sample(mesh: Mesh, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarra
 
 
 def visible_sample(mesh: Mesh, wall: np.ndarray, count: int, share: float = 0.1, seed: int = 0) -> np.ndarray:
-    """``[N, 3]`` of ``count`` points of the mesh: those whose front at least ``share`` of the wall points
-    ``[W, 3]`` see.
+    """Points of a mesh whose front enough of the wall can see.
+
+    Args:
+        mesh: the surface, which hides what is behind it.
+        wall: ``[W, 3]`` wall points, m.
+        count: points sampled before those unseen are left out.
+        share: of the wall points that must see a point.
+        seed: of the draw.
+
+    Returns:
+        ``[N, 3]`` points, m, N ≤ ``count``.
     """
     points, face = sample(mesh, count, seed)
     normals = mesh.face_vectors[face]
@@ -67,20 +90,27 @@ def visible_sample(mesh: Mesh, wall: np.ndarray, count: int, share: float = 0.1,
 
 
 def distance_to(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """``[N]`` distance of points ``[N, 3]`` to the nearest point of a mesh's faces, m."""
+    """Distance of points to the nearest point of a mesh's faces.
+
+    Args:
+        mesh: the surface.
+        points: ``[N, 3]``, m.
+
+    Returns:
+        ``[N]``, m.
+    """
     import open3d as o3d
 
+    tensor = o3d.core.Tensor.from_numpy
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(mesh.vertices.astype(np.float32)), o3d.core.Tensor(mesh.faces.astype(np.uint32))
-    )
-    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy().astype(np.float64)
+    scene.add_triangles(tensor(mesh.vertices.astype(np.float32)), tensor(mesh.faces.astype(np.uint32)))
+    return scene.compute_distance(tensor(points.astype(np.float32))).numpy().astype(np.float64)
 
 
 def surface_distances(
     surface: Mesh | None, truth: Mesh, visible: np.ndarray, count: int = 20_000, seed: int = 0
 ) -> Distances:
-    """Compare a reconstruction with the truth.
+    """Compare a reconstruction with the truth, both ways.
 
     Args:
         surface: the reconstruction; None where there is none, which leaves both lists of distances empty.
@@ -88,6 +118,10 @@ def surface_distances(
         visible: ``[M, 3]`` points of the truth that can be seen, from which distances to the reconstruction
             are taken.
         count: points sampled on the reconstruction.
+        seed: of the draw.
+
+    Returns:
+        the sampled points and their distances.
     """
     if surface is None:
         nothing = np.zeros((0, 3))
