@@ -24,7 +24,15 @@ READERS: tuple[ModuleType, ...] = (ytal, lct, fk, phasor_field, zaragoza, chen, 
 
 
 def read_capture(path: str | Path, fmt: str = "auto", *, options: ReaderOptions | None = None) -> Capture:
-    """Read a capture; ``fmt`` forces a format instead of recognising it from the file's content.
+    """Read a capture file of any known format, turned into the world frame.
+
+    Args:
+        path: the file, or the folder of its parts.
+        fmt: ``auto`` to recognise the format from the file's content, or the NAME of one of `READERS`.
+        options: facts that the file does not say, or says wrongly; None for none.
+
+    Returns:
+        the capture, its counts as they are in the file.
 
     Raises:
         CaptureError: no such file, unknown format, damaged or unusable data, or an option that the format
@@ -43,7 +51,11 @@ def read_capture(path: str | Path, fmt: str = "auto", *, options: ReaderOptions 
 
 
 def detect_format(path: str | Path) -> str:
-    """Name of the format, from the arrays that the file lists (no array is read)."""
+    """Name of the format, from the arrays that the file lists (no array is read).
+
+    Raises:
+        CaptureError: no such file, or of no known format.
+    """
     return _recognise(open_contents(path)).NAME
 
 

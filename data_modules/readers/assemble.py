@@ -42,15 +42,31 @@ def assemble(
     """Apply the options, put the spots in the order x, y ascending, and build the capture.
 
     Args:
+        path: the file, for the provenance.
+        fmt: name of the format, for the provenance.
+        options: what the user says; it overrides what the file says.
         counts: ``[S, T]`` in the file's order of spots.
-        laser, sensor: ``[S, 3]`` wall points in the world frame, m.
-        shape: scanned grid, in the file's order of axes.
+        laser: ``[S, 3]`` lit wall points in the world frame, m.
+        sensor: ``[S, 3]`` observed wall points, m.
+        bin_length: optical path of one bin, m.
+        shape: scanned grid, in the file's order of axes; None for irregular spots.
+        t_start: path length at the start of bin 0, m.
+        gate: ``(first, last)`` bins that may be fitted; None for all.
         behind_pulse: choose the gate by `gate_after_direct_pulse`, where the user gives none.
+        laser_normal: ``[S, 3]`` wall normals at ``laser``; None for +z.
+        sensor_normal: ``[S, 3]`` wall normals at ``sensor``; None for +z.
         is_counts: None to tell by whether all values are whole numbers.
+        exposure_s: exposure per spot, s, where the file says it.
         scan_order: ``[S]`` rank of each spot, where the file says it.
         listed: ``[S]`` for a file that lists its spots: the row of that list which each spot comes from.
         steps: what was done to the data, for the provenance.
         facts: further provenance.
+
+    Returns:
+        the capture in the world frame.
+
+    Raises:
+        CaptureError: the scan order does not fit the spots, or the data make no `Capture`.
     """
     steps = list(steps or [])
     spots = counts.shape[0]
@@ -85,9 +101,13 @@ def assemble(
             counts = counts[order.ravel()]
             vectors = [vector[order.ravel()] for vector in vectors]
             steps.append("spots ordered by x, then y")
+    laser, sensor, laser_normal, sensor_normal = vectors
     return Capture(
         counts,
-        *vectors,
+        laser,
+        sensor,
+        laser_normal,
+        sensor_normal,
         bin_length=bin_length,
         t_start=t_start,
         gate=gate,
@@ -100,13 +120,36 @@ def assemble(
 
 
 def cell_centres(number: int, side: float) -> np.ndarray:
-    """``[number]`` centres of equal cells of a centred line of length ``side``, ascending, m."""
+    """Centres of equal cells of a line that is centred on 0.
+
+    Args:
+        number: of cells.
+        side: length of the line, m.
+
+    Returns:
+        ``[number]`` centres, ascending, m.
+
+    Examples:
+        >>> cell_centres(4, 2.0).tolist()
+        [-0.75, -0.25, 0.25, 0.75]
+    """
     return side * ((np.arange(number) + 0.5) / number - 0.5)
 
 
 def wall_points(first: np.ndarray, second: np.ndarray, axes: str) -> np.ndarray:
-    """``[n₁·n₂, 3]`` points at z = 0 of a grid whose first and second file axis run along ``axes`` (``xy`` or
-    ``yx``).
+    """Points of a grid on the wall z = 0, in the file's order of axes.
+
+    Args:
+        first: ``[n₁]`` coordinates along the first file axis, m.
+        second: ``[n₂]`` coordinates along the second, m.
+        axes: world axes that the two run along, ``xy`` or ``yx``.
+
+    Returns:
+        ``[n₁·n₂, 3]`` points, the second axis changing fastest, m.
+
+    Examples:
+        >>> wall_points(np.array([1.0, 0.0]), np.array([5.0]), "yx").tolist()
+        [[5.0, 1.0, 0.0], [5.0, 0.0, 0.0]]
     """
     a, b = (grid.ravel() for grid in np.meshgrid(first, second, indexing="ij"))
     x, y = (a, b) if axes == "xy" else (b, a)
@@ -114,8 +157,22 @@ def wall_points(first: np.ndarray, second: np.ndarray, axes: str) -> np.ndarray:
 
 
 def ascending_order(shape: tuple[int, ...], laser: np.ndarray, sensor: np.ndarray) -> np.ndarray:
-    """File rows of a scan ``[n₁, n₂]`` or ``[l₁, l₂, s₁, s₂]``, with each pair of axes turned so that it runs
-    along +x, +y.
+    """File rows of a scan, with each pair of axes turned so that it runs along +x, +y.
+
+    Args:
+        shape: of the scan in the file, ``[n₁, n₂]`` or ``[l₁, l₂, s₁, s₂]``.
+        laser: ``[S, 3]`` wall points in the world frame, m.
+        sensor: ``[S, 3]`` wall points, m.
+
+    Returns:
+        indices of the file's rows, in the scan's shape in the world frame.
+
+    Examples:
+        A scan whose rows run from the top downwards and whose columns run along +x:
+
+        >>> points = wall_points(np.array([0.1, -0.1]), np.array([-0.2, 0.2]), "yx")
+        >>> ascending_order((2, 2), points, points).tolist()
+        [[2, 0], [3, 1]]
     """
     order = np.arange(len(laser)).reshape(shape)
     scanned = laser if np.ptp(laser, axis=0).max() > 0 else sensor
@@ -138,8 +195,20 @@ def _run(points: np.ndarray, order: np.ndarray, axis: int) -> np.ndarray:
 
 
 def grid_of(points: np.ndarray) -> tuple[np.ndarray, tuple[int, int]] | None:
-    """Order and shape ``(nx, ny)`` in which listed points fill a rectangular grid exactly once; None where
-    they do not.
+    """Order in which listed points fill a rectangular grid exactly once; None where they do not.
+
+    Args:
+        points: ``[S, 3]`` (or ``[S, 2]``) wall points, m; coordinates closer than 1e-4 of the extent are one.
+
+    Returns:
+        ``[S]`` rows of the list, x then y ascending, and the grid's shape ``(nx, ny)``.
+
+    Examples:
+        >>> order, shape = grid_of(np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 2.0], [1.0, 2.0]]))
+        >>> order.tolist(), shape
+        ([1, 2, 0, 3], (2, 2))
+        >>> grid_of(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]])) is None
+        True
     """
     (column, nx), (row, ny) = _lines(points[:, 0]), _lines(points[:, 1])
     if nx * ny != len(points):
@@ -150,7 +219,10 @@ def grid_of(points: np.ndarray) -> tuple[np.ndarray, tuple[int, int]] | None:
 
 
 def _lines(values: np.ndarray) -> tuple[np.ndarray, int]:
-    """Which of the distinct coordinates each value is, where values closer than 1e-4 of the extent are one."""
+    """Which of the distinct coordinates each value is, and how many there are.
+
+    Values closer than 1e-4 of the extent are one.
+    """
     order = np.argsort(values, kind="stable")
     steps = np.diff(values[order], prepend=values[order[:1]]) > 1e-4 * max(float(np.ptp(values)), 1e-9)
     index = np.empty(len(values), dtype=np.int64)
@@ -166,7 +238,26 @@ def counted(values: np.ndarray) -> bool:
 def acquisition_order(
     wanted: str | np.ndarray | None, shape: tuple[int, ...] | None, spots: int
 ) -> np.ndarray | None:
-    """``[S]`` rank of each spot, in the file's order of spots; None where nothing was said."""
+    """Rank of each spot in the order of acquisition, in the file's order of spots.
+
+    Args:
+        wanted: ``raster`` (last axis fastest), ``serpentine`` (the same, every second line backwards),
+            ``columns`` (first axis fastest), the ranks themselves, or None.
+        shape: of the scanned grid in the file's order of axes; None where there is none.
+        spots: number S of spots.
+
+    Returns:
+        ``[S]`` ranks; None where nothing was said.
+
+    Raises:
+        CaptureError: an unknown name, or one that needs a scanned grid where there is none.
+
+    Examples:
+        >>> acquisition_order("serpentine", (2, 3), 6).tolist()
+        [0, 1, 2, 5, 4, 3]
+        >>> acquisition_order("columns", (2, 3), 6).tolist()
+        [0, 2, 4, 1, 3, 5]
+    """
     if wanted is None:
         return None
     if not isinstance(wanted, str):
@@ -198,12 +289,21 @@ def remove_delays(counts: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, f
     Returns:
         ``[S, T - longest]`` counts (no bin wraps round or is made up), the mean of what rounding left over
         (bins, to be added to the time of bin 0), and a sentence for the provenance.
+
+    Raises:
+        CaptureError: delays that are not finite or negative, or that leave no bin.
+
+    Examples:
+        >>> counts, offset, told = remove_delays(np.array([[0, 0, 7, 1], [5, 2, 0, 0]]), np.array([2.0, 0.0]))
+        >>> counts.tolist(), offset
+        ([[7, 1], [5, 2]], 0.0)
     """
     if not np.isfinite(delays).all() or delays.min() < 0:
         raise CaptureError("the delays to take off each spot must be finite and not negative")
     if delays.max() >= counts.shape[1] - 0.5:
         raise CaptureError(
-            f"delays of up to {delays.max():.0f} bins leave nothing of the file's {counts.shape[1]} bins; check the bin width"
+            f"delays of up to {delays.max():.0f} bins leave nothing of the file's {counts.shape[1]} bins; "
+            "check the bin width"
         )
     whole = np.rint(delays).astype(np.int64)
     left = counts.shape[1] - int(whole.max())
@@ -224,15 +324,40 @@ def remove_delays(counts: np.ndarray, delays: np.ndarray) -> tuple[np.ndarray, f
 
 
 def smooth(transient: np.ndarray, width: int) -> np.ndarray:
-    """Running mean over ``width`` bins, edges repeated."""
+    """Running mean, edges repeated.
+
+    Args:
+        transient: ``[T]``.
+        width: bins that each mean is taken over.
+
+    Returns:
+        ``[T]`` float64.
+
+    Examples:
+        >>> smooth(np.array([0, 3, 0, 0]), 3).tolist()
+        [1.0, 1.0, 1.0, 0.0]
+    """
     padded = np.pad(transient.astype(np.float64), (width // 2, width - 1 - width // 2), mode="edge")
     total = np.cumsum(np.concatenate([[0.0], padded]))
     return (total[width:] - total[:-width]) / width
 
 
 def direct_pulse(mean: np.ndarray, bin_length: float, t_start: float = 0.0) -> int | None:
-    """Bin of the wall's own return: the highest bin of the mean transient ``[T]``, if it comes within 0.3 m
-    of path zero.
+    """Bin of the wall's own return: the highest of the mean transient, if it comes near path zero.
+
+    Args:
+        mean: ``[T]`` transient averaged over the spots.
+        bin_length: optical path of one bin, m.
+        t_start: path length at the start of bin 0, m.
+
+    Returns:
+        the bin; None where the highest lies 0.3 m of path or more from path zero.
+
+    Examples:
+        >>> direct_pulse(np.array([0.0, 9.0, 1.0, 3.0]), bin_length=0.1)
+        1
+        >>> direct_pulse(np.array([0.0, 2.0, 1.0, 3.0]), bin_length=0.1) is None
+        True
     """
     peak = int(np.argmax(mean))
     return peak if abs(t_start + (peak + 0.5) * bin_length) < DIRECT_PULSE_PATH else None
@@ -246,6 +371,11 @@ def gate_after_direct_pulse(
     The mean transient has a valley between the pulse's tail and the largest later rise above the lowest level
     so far. The gate begins where the tail, above that valley, has sunk below 1e-4 of the pulse's peak for
     good. Without a later rise: 0.72 m of path (2.4 ns) behind the pulse.
+
+    Args:
+        counts: ``[S, T]``.
+        bin_length: optical path of one bin, m.
+        t_start: path length at the start of bin 0, m.
 
     Returns:
         ``(first, last)`` and a sentence for the provenance; all bins where there is no direct pulse.
@@ -275,7 +405,12 @@ def gate_after_direct_pulse(
 
 
 def bin_length_of(bin_width_ps: float) -> float:
-    """Optical path of one bin, m."""
+    """Optical path of one bin of a width in ps, m.
+
+    Examples:
+        >>> bin_length_of(4.0)
+        0.001199169832
+    """
     return SPEED_OF_LIGHT * bin_width_ps * 1e-12
 
 

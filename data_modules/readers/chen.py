@@ -1,5 +1,6 @@
-"""Confocal renders of Chen et al. (Learned feature embeddings, SIGGRAPH Asia 2020): one Radiance HDR picture
-``[T·N, N]``.
+"""Confocal renders of Chen et al. (Learned feature embeddings, SIGGRAPH Asia 2020).
+
+One Radiance HDR picture ``[T·N, N]``: T square frames, stacked downwards.
 """
 
 from __future__ import annotations
@@ -27,11 +28,26 @@ WALL_SIZE = 2.0  # m
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file is a Radiance picture, or a video that `read` refuses with a reason."""
     return contents.container in ("radiance", "mp4")
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Grey value of each pixel by Rec. 601 luma (the renders are grey); frames are time bins from path zero."""
+    """One HDR picture as a capture; frames are time bins from path zero.
+
+    The value of a pixel is its grey by Rec. 601 luma (the renders are grey).
+
+    Args:
+        path: of the picture.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        a confocal capture of expected values.
+
+    Raises:
+        CaptureError: a video, another kind of file, a damaged picture, or one that is not made of square
+            frames.
+    """
     container = open_contents(path).container
     if container == "mp4":
         raise CaptureError(
@@ -43,7 +59,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     rows, side = picture.shape[:2]
     if rows % side:
         raise CaptureError(
-            f"{path.name} is {rows} × {side} pixels; expected T·N rows of N pixels, one N × N frame a time bin"
+            f"{path.name} is {rows} × {side} pixels; expected T·N rows of N pixels, one N × N frame a time "
+            "bin"
         )
     frames = (picture @ np.array([0.299, 0.587, 0.114], dtype=np.float32)).reshape(rows // side, side * side)
     length = bin_length_of(options.bin_width_ps) if options.bin_width_ps else BIN_LENGTH
@@ -60,6 +77,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         shape=(side, side),
         is_counts=False,
         steps=[
-            f"bins of {1e12 * length / SPEED_OF_LIGHT:.4g} ps, wall {sides[0]:g} m × {sides[1]:g} m, grey by Rec. 601 luma"
+            f"bins of {1e12 * length / SPEED_OF_LIGHT:.4g} ps, wall {sides[0]:g} m × {sides[1]:g} m, grey "
+            "by Rec. 601 luma"
         ],
     )

@@ -1,5 +1,6 @@
-"""Any pairs of laser and detector points as ``C_i``, ``C_d``, ``sub_Sig`` (Liu et al., Nat. Commun. 14, 3230,
-2023).
+"""Any pairs of laser and detector points as ``C_i``, ``C_d``, ``sub_Sig``.
+
+Source: Liu et al., Nat. Commun. 14, 3230, 2023.
 """
 
 from __future__ import annotations
@@ -15,7 +16,10 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
 NAME = "cid"
-DESCRIPTION = "C_i / C_d / sub_Sig .mat files: bins of 16 ps, wall coordinates in 0.01 m, counts; second column +x, third +y"
+DESCRIPTION = (
+    "C_i / C_d / sub_Sig .mat files: bins of 16 ps, wall coordinates in 0.01 m, counts; "
+    "second column +x, third +y"
+)
 EXPECTS = "C_i [S, 3], C_d [S, 3] and sub_Sig [S, T], in one .mat file or three of one folder"
 OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
 BIN_WIDTH_PS = 16.0
@@ -24,14 +28,27 @@ _KEYS = ("C_i", "C_d", "sub_Sig")
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file holds one of the three arrays, or the folder all of them."""
     if contents.container == "folder":
         return contents.has(*_KEYS)
     return any(contents.ndim(key) == 2 for key in _KEYS)
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Times are paths from laser to detector point. The bins that the file leaves empty at both ends are
-    outside the gate.
+    """Three arrays, in one file or in several of one folder, as a capture.
+
+    Times are paths from laser to detector point. The bins that the file leaves empty at both ends are outside
+    the gate.
+
+    Args:
+        path: the file, one of the three files, or their folder.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        the capture; a scanned grid where the points make one.
+
+    Raises:
+        CaptureError: an array is missing or damaged, or shapes disagree.
     """
     contents = open_contents(path)
     if not contents.has(*_KEYS) and contents.container != "folder":
@@ -40,7 +57,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     laser, sensor, counts = contents.places("C_i"), contents.places("C_d"), contents.counts("sub_Sig")
     if counts.ndim != 2 or laser.shape != (len(counts), 3) or sensor.shape != laser.shape:
         raise CaptureError(
-            f"{path.name} must hold C_i [S, 3], C_d [S, 3] and sub_Sig [S, T]; found {laser.shape}, {sensor.shape}, {counts.shape}"
+            f"{path.name} must hold C_i [S, 3], C_d [S, 3] and sub_Sig [S, T]; found {laser.shape}, "
+            f"{sensor.shape}, {counts.shape}"
         )
     width = options.bin_width_ps or BIN_WIDTH_PS
     laser, sensor, scale = _world(laser, sensor, options)
@@ -67,8 +85,9 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 def _world(
     laser: np.ndarray, sensor: np.ndarray, options: ReaderOptions
 ) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Columns (depth, horizontal, vertical) to (x, y, z) in metres, the scanned rectangle's middle at the
-    origin.
+    """Columns (depth, horizontal, vertical) to (x, y, z) in metres, and the scale of both wall axes.
+
+    The scanned rectangle's middle comes to lie at the origin.
     """
     scanned = laser if np.ptp(laser, axis=0).max() >= np.ptp(sensor, axis=0).max() else sensor
     low, high = scanned[:, 1:].min(axis=0), scanned[:, 1:].max(axis=0)
@@ -103,7 +122,7 @@ def _kept_bins(counts: np.ndarray) -> tuple[tuple[int, int] | None, list[str]]:
     told = [f"bins {gate[0]} to {gate[1] - 1} hold counts and are the gate unless another is given"]
     seen = counts.any(axis=1)
     if not seen.all():
-        told.append(f"{int((~seen).sum())} of {len(seen)} spots hold no counts at all")
+        told.append(f"{int((~seen).sum())} of {len(counts)} spots hold no counts at all")
     begins = np.argmax(counts > 0, axis=1)[seen]
     late = begins > gate[0] + 0.1 * (gate[1] - gate[0])
     if late.any():

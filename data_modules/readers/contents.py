@@ -26,8 +26,12 @@ _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zli
 
 @dataclass(frozen=True)
 class Entry:
-    """One array: its shape (MATLAB's axis order where MATLAB wrote it), whether it holds real numbers, its
-    full size in bytes.
+    """One array of a file, seen without reading it.
+
+    Args:
+        shape: in MATLAB's axis order where MATLAB wrote it.
+        numeric: it holds real numbers.
+        size: in full, bytes.
     """
 
     shape: tuple[int, ...]
@@ -37,13 +41,12 @@ class Entry:
 
 @dataclass(frozen=True)
 class Contents:
-    """The arrays of a file (or of the ``.mat`` files of a folder) by name; fields of a MATLAB struct as
-    ``struct.field``.
+    """The arrays of a file, or of the ``.mat`` files of a folder, by name.
 
     Args:
         path: the file or folder.
         container: ``hdf5``, ``mat5`` (MATLAB up to v7.2), ``radiance`` (HDR picture), ``mp4`` or ``folder``.
-        entries: what each array is, by name.
+        entries: what each array is, by name; fields of a MATLAB struct as ``struct.field``.
         matlab: an HDF5 file written by MATLAB (v7.3), whose axes HDF5 shows in reverse.
         parts: for a folder, the contents of the file that each entry lies in.
     """
@@ -58,6 +61,7 @@ class Contents:
         return name in self.entries
 
     def has(self, *names: str) -> bool:
+        """Whether all of these arrays are there."""
         return all(name in self.entries for name in names)
 
     def ndim(self, name: str) -> int:
@@ -66,6 +70,11 @@ class Contents:
         return len(entry.shape) if entry is not None and entry.numeric else -1
 
     def require(self, *names: str) -> None:
+        """Refuse a file that lacks an array.
+
+        Raises:
+            CaptureError: one of them is absent; the message says what there is.
+        """
         missing = [name for name in names if name not in self.entries]
         if missing:
             raise CaptureError(f"{self.path.name} has no {', '.join(missing)}; it holds {self.summary()}")
@@ -104,7 +113,11 @@ class Contents:
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
 
     def counts(self, name: str) -> np.ndarray:
-        """One array of transients: not empty and finite."""
+        """One array of transients: not empty and finite.
+
+        Raises:
+            CaptureError: as of `read`, or empty, or NaN or infinite values in it.
+        """
         values = self.read(name)
         if values.size == 0:
             raise CaptureError(f"{name} in {self.path.name} is empty ({'×'.join(map(str, values.shape))})")
@@ -115,14 +128,22 @@ class Contents:
         return values
 
     def places(self, name: str) -> np.ndarray:
-        """Coordinates or directions as float64: finite and below a thousand kilometres."""
+        """Coordinates or directions as float64: finite and below a thousand kilometres.
+
+        Raises:
+            CaptureError: as of `read`, or other values.
+        """
         values = self.read(name).astype(np.float64)
         if values.size == 0 or not np.abs(values).max() < 1e6:
             raise CaptureError(f"{name} in {self.path.name} must hold finite coordinates in metres")
         return values
 
     def scalar(self, name: str) -> float:
-        """A finite number stored as an array of one element."""
+        """A finite number stored as an array of one element.
+
+        Raises:
+            CaptureError: as of `read`, or several values, or not finite.
+        """
         values = self.read(name)
         if values.size != 1 or not np.isfinite(values).all():
             raise CaptureError(
@@ -144,13 +165,15 @@ class Contents:
         on_disk = self.path.stat().st_size
         if entry.size > _DEFLATE_LIMIT * on_disk:
             raise CaptureError(
-                f"{name} in {self.path.name} claims {entry.size / 1e6:.0f} MB in a file of {on_disk / 1e6:.3g} MB; "
+                f"{name} in {self.path.name} claims {entry.size / 1e6:.0f} MB in a file of "
+                f"{on_disk / 1e6:.3g} MB; "
                 "the file is damaged or truncated"
             )
         free = psutil.virtual_memory().available
         if entry.size > free:
             raise CaptureError(
-                f"{name} in {self.path.name} needs {entry.size / 1e9:.1f} GB and {free / 1e9:.1f} GB are free; use a smaller file"
+                f"{name} in {self.path.name} needs {entry.size / 1e9:.1f} GB and {free / 1e9:.1f} GB are "
+                "free; use a smaller file"
             )
 
     def _read_hdf5(self, name: str) -> np.ndarray:
@@ -160,8 +183,15 @@ class Contents:
 
 
 def open_contents(path: str | Path) -> Contents:
-    """List a file or folder without reading its arrays (but for the structs of old MATLAB files, which have
-    no table).
+    """List a file or folder without reading its arrays.
+
+    (The structs of old MATLAB files, which have no table, are unpacked on the way.)
+
+    Args:
+        path: the file, or a folder of ``.mat`` files.
+
+    Returns:
+        what is there.
 
     Raises:
         CaptureError: nothing there, not readable, damaged, or of no known container.
@@ -196,7 +226,11 @@ def open_contents(path: str | Path) -> Contents:
 
 
 def open_folder(path: Path) -> Contents:
-    """The arrays of all ``.mat`` files of a folder together; unreadable files are passed over."""
+    """The arrays of all ``.mat`` files of a folder together; unreadable files are passed over.
+
+    Raises:
+        CaptureError: there is no readable one.
+    """
     parts: dict[str, Contents] = {}
     entries: dict[str, Entry] = {}
     for file in sorted(path.glob("*.mat"))[:64]:

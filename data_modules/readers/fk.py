@@ -1,5 +1,7 @@
-"""Confocal captures of f-k migration (Lindell, Wetzstein, O'Toole, SIGGRAPH 2019): ``meas``, with ``tofgrid``
-beside it.
+"""Confocal captures of f-k migration: ``meas``, with ``tofgrid`` beside it.
+
+Source: Lindell, Wetzstein, O'Toole, *Wave-based non-line-of-sight imaging using fast f-k migration*, SIGGRAPH
+2019.
 """
 
 from __future__ import annotations
@@ -22,19 +24,39 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
 NAME = "fk"
-DESCRIPTION = "f-k migration .mat v7.3, confocal: bins of 32 ps, wall 2 m × 2 m, counts; rows from the top (-y), columns along -x"
-EXPECTS = "meas [rows, columns, T] in a MATLAB v7.3 file, with tofgrid [rows, columns] in it or in tof.mat beside it"
+DESCRIPTION = (
+    "f-k migration .mat v7.3, confocal: bins of 32 ps, wall 2 m × 2 m, counts; "
+    "rows from the top (-y), columns along -x"
+)
+EXPECTS = (
+    "meas [rows, columns, T] in a MATLAB v7.3 file, "
+    "with tofgrid [rows, columns] in it or in tof.mat beside it"
+)
 OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
 BIN_WIDTH_PS = 32.0
 WALL_SIZE = 2.0
 
 
 def matches(contents: Contents) -> bool:
+    """Whether a MATLAB v7.3 file holds a cube ``meas``."""
     return contents.container == "hdf5" and contents.ndim("meas") == 3
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """``tofgrid`` (ps) is each spot's time from laser to wall to detector; it is taken off by whole bins."""
+    """A cube ``meas`` as a capture, each spot's delay taken off by whole bins.
+
+    ``tofgrid`` (ps) is each spot's time from laser to wall to detector.
+
+    Args:
+        path: of the file.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        a confocal capture, gated behind the direct pulse.
+
+    Raises:
+        CaptureError: ``meas`` is missing or damaged, or ``tofgrid`` is of another scan.
+    """
     contents = open_contents(path)
     contents.require("meas")
     if contents.ndim("meas") != 3:
@@ -67,12 +89,12 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         t_start=t_start,
         shape=(rows, columns),
         behind_pulse=True,
-        steps=[*steps],
+        steps=steps,
     )
 
 
 def _delays(contents: Contents, shape: tuple[int, int]) -> np.ndarray | None:
-    """``[S]`` ps from the file itself, or from the ``tof.mat`` that the public data keep in the same folder."""
+    """``[S]`` ps from the file itself, or from the ``tof.mat`` that the public data keep beside it."""
     source = contents
     if "tofgrid" not in contents:
         beside = contents.path.with_name("tof.mat")
@@ -84,6 +106,7 @@ def _delays(contents: Contents, shape: tuple[int, int]) -> np.ndarray | None:
         return None
     if delays.shape != shape:
         raise CaptureError(
-            f"tofgrid in {source.path.name} is {delays.shape} where meas scans {shape}; use the one of this scene"
+            f"tofgrid in {source.path.name} is {delays.shape} where meas scans {shape}; use the one of "
+            "this scene"
         )
     return delays.ravel().astype(np.float64)

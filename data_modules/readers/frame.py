@@ -8,10 +8,25 @@ from nlos_lit.capture.errors import CaptureError
 
 
 def wall_rotation(normals: np.ndarray) -> np.ndarray:
-    """``[3, 3]`` proper rotation that turns the mean wall normal to +z and keeps the file's vertical up.
+    """The rotation that turns the mean wall normal to +z and keeps the file's vertical up.
 
-    The vertical is the file's y, or its z where the wall's normal runs along y. The identity for a normal
-    along +z.
+    The vertical is the file's y, or its z where the wall's normal runs along y.
+
+    Args:
+        normals: ``[.., 3]`` wall normals in the file's frame, towards the hidden scene.
+
+    Returns:
+        ``[3, 3]`` proper rotation, for column vectors; the identity for a normal along +z.
+
+    Raises:
+        CaptureError: the normals cancel or are missing.
+
+    Examples:
+        A wall that faces -y, with z up:
+
+        >>> turn = wall_rotation(np.array([[0.0, -1.0, 0.0]]))
+        >>> (turn @ [0.0, -1.0, 0.0]).round(9).tolist(), (turn @ [0.0, 0.0, 1.0]).round(9).tolist()
+        ([0.0, 0.0, 1.0], [0.0, 1.0, 0.0])
     """
     mean = normals.reshape(-1, 3).astype(np.float64).mean(axis=0)
     length = np.linalg.norm(mean)
@@ -29,5 +44,17 @@ def wall_rotation(normals: np.ndarray) -> np.ndarray:
 
 
 def device_distances(device: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """``[S]`` distances of wall points from the laser or detector, m."""
+    """Distances of wall points from the laser or detector.
+
+    Args:
+        device: ``[3]`` its place, m.
+        points: ``[S, 3]`` wall points in the same frame, m.
+
+    Returns:
+        ``[S]``, m.
+
+    Examples:
+        >>> device_distances(np.array([0.0, 0.0, 4.0]), np.array([[0.0, 3.0, 0.0]])).tolist()
+        [5.0]
+    """
     return np.linalg.norm(points - device, axis=-1)

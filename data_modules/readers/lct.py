@@ -1,5 +1,7 @@
-"""Confocal captures of the light-cone transform (O'Toole, Lindell, Wetzstein, Nature 2018): ``rect_data``,
-``width``.
+"""Confocal captures of the light-cone transform: ``rect_data``, ``width``.
+
+Source: O'Toole, Lindell, Wetzstein, *Confocal non-line-of-sight imaging based on the light-cone transform*,
+Nature 2018.
 """
 
 from __future__ import annotations
@@ -22,12 +24,24 @@ BIN_WIDTH_PS = 4.0
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file holds ``rect_data`` and ``width``, and no ``ts`` as phasor-field files have."""
     return contents.ndim("rect_data") == 3 and "width" in contents and "ts" not in contents
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Bin 0 holds the direct pulse's peak, so path zero is its start; spots are the centres of equal cells of
-    the square.
+    """A cube ``rect_data`` as a capture; spots are the centres of equal cells of the square.
+
+    Bin 0 holds the direct pulse's peak, so path zero is its start.
+
+    Args:
+        path: of the file.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        a confocal capture, gated behind the direct pulse.
+
+    Raises:
+        CaptureError: an array is missing or damaged, or the wall's width is not positive.
     """
     contents = open_contents(path)
     contents.require("rect_data")

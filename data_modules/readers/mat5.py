@@ -49,11 +49,16 @@ class Variable:
 
     @property
     def numeric(self) -> bool:
+        """Whether it holds real numbers."""
         return self.kind in _NUMBERS and not self.complex
 
 
 def list_mat5(path: Path) -> dict[str, tuple[tuple[int, ...], bool]]:
-    """Shape and whether it holds real numbers, by name; fields of scalar structs as ``struct.field``."""
+    """Shape and whether it holds real numbers, by name; fields of scalar structs as ``struct.field``.
+
+    Raises:
+        ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).
+    """
     found: dict[str, tuple[tuple[int, ...], bool]] = {}
     view = _view(path)
     order = _order(view)
@@ -69,7 +74,19 @@ def list_mat5(path: Path) -> dict[str, tuple[tuple[int, ...], bool]]:
 
 
 def read_mat5(path: Path, name: str) -> np.ndarray:
-    """One numeric array, in the type it is stored in (MATLAB stores whole doubles in fewer bytes)."""
+    """One numeric array, in the type it is stored in (MATLAB stores whole doubles in fewer bytes).
+
+    Args:
+        path: of the file.
+        name: of the array; ``struct.field`` for a field of a scalar struct.
+
+    Returns:
+        the array in MATLAB's axis order.
+
+    Raises:
+        CaptureError: it is not there any more.
+        ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).
+    """
     wanted, _, member = name.partition(".")
     view = _view(path)
     order = _order(view)

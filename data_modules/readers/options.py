@@ -75,11 +75,8 @@ class ReaderOptions:
         """``wall_size`` as (x, y), m."""
         if self.wall_size is None:
             return None
-        return (
-            tuple(self.wall_size)
-            if isinstance(self.wall_size, Sequence)
-            else (self.wall_size, self.wall_size)
-        )
+        x, y = self.wall_size if isinstance(self.wall_size, Sequence) else (self.wall_size, self.wall_size)
+        return x, y
 
 
 def _positive(name: str, value: float | None) -> None:

@@ -1,5 +1,6 @@
-"""Non-confocal captures of phasor-field imaging (Liu et al., Nature 2019, as prepared for Liu et al., Nat.
-Commun. 2020).
+"""Non-confocal captures of phasor-field imaging.
+
+Source: Liu et al., Nature 2019, as prepared for Liu, Bauer, Velten, Nat. Commun. 2020.
 """
 
 from __future__ import annotations
@@ -24,26 +25,39 @@ OPTIONS = COMMON_OPTIONS | {"bin_width_ps", "wall_size"}
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file holds a cube ``rect_data`` with ``ts`` and ``SPAD_index``."""
     return contents.ndim("rect_data") == 3 and contents.has("ts", "SPAD_index")
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """The laser scans the grid; the detector looks at grid point ``SPAD_index`` (row, column, counted from
-    1).
+    """A cube ``rect_data`` as a capture: the laser scans the grid, the detector looks at one of its points.
 
-    Times are taken as path from laser to detector point; the public demo adds 0.1 m to the depth term as an
-    electrical delay, which ``t_start = -0.1`` would express.
+    ``SPAD_index`` is that point's row and column, counted from 1. Times are taken as path from laser to
+    detector point; the public demo adds 0.1 m to the depth term as an electrical delay, which ``t_start =
+    -0.1`` would express.
+
+    Args:
+        path: of the file.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        a capture with one sensor point, gated behind the direct pulse.
+
+    Raises:
+        CaptureError: an array is missing or damaged, or its numbers make no sense.
     """
     contents = open_contents(path)
     contents.require("rect_data", "SPAD_index")
     if contents.ndim("rect_data") != 3:
         raise CaptureError(
-            f"rect_data in {path.name} must be [rows, columns, bins]; found {contents.entries['rect_data'].shape}"
+            f"rect_data in {path.name} must be [rows, columns, bins]; found "
+            f"{contents.entries['rect_data'].shape}"
         )
     width = options.bin_width_ps or 1e12 * contents.scalar("ts")
     if not 0.1 < width < 1e4:
         raise CaptureError(
-            f"ts in {path.name} makes bins of {width:g} ps; expected seconds, about 4e-12 (or give bin_width_ps)"
+            f"ts in {path.name} makes bins of {width:g} ps; expected seconds, about 4e-12 (or give "
+            "bin_width_ps)"
         )
     data = contents.counts("rect_data")
     rows, columns, bins = data.shape
@@ -64,7 +78,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         shape=(rows, columns),
         behind_pulse=True,
         steps=[
-            f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column {column + 1}"
+            f"bins of {width:g} ps, spots {across:g} × {down:g} m apart, detector at row {row + 1}, column "
+            f"{column + 1}"
         ],
     )
 
@@ -95,6 +110,7 @@ def _spacing(contents: Contents, options: ReaderOptions, rows: int, columns: int
         spacing = float(aperture[0]) / max(rows - 1, 1) if aperture.size else 0.0
     if not (np.isfinite(spacing) and spacing > 0):
         raise CaptureError(
-            f"the spot spacing in {contents.path.name} must be a positive length; found {spacing}; give wall_size"
+            f"the spot spacing in {contents.path.name} must be a positive length; found {spacing}; give "
+            "wall_size"
         )
     return spacing, spacing

@@ -1,5 +1,6 @@
-"""Radiance HDR pictures (RGBE): flat and new-style run-length scanlines, as in the Radiance reference manual,
-'filefmts'.
+"""Radiance HDR pictures (RGBE): flat and new-style run-length scanlines.
+
+Source: the Radiance reference manual, 'filefmts'.
 """
 
 from __future__ import annotations
@@ -15,7 +16,13 @@ _SIZE_LINE = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
 
 
 def read_radiance(path: Path) -> np.ndarray:
-    """``[rows, columns, 3]`` float32 red, green, blue.
+    """A picture's colours.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        ``[rows, columns, 3]`` float32 red, green, blue.
 
     Raises:
         CaptureError: no size line, another orientation, a picture cut short, or a broken run.
@@ -66,6 +73,7 @@ def _decode_runs(body: memoryview, rows: int, columns: int, path: Path) -> np.nd
                 if at + 1 >= len(body):
                     raise CaptureError(f"{path.name} is cut short at row {row} of {rows}")
                 number = body[at]
+                piece: bytes | memoryview
                 if number > 128:
                     number -= 128
                     piece = bytes((body[at + 1],)) * number

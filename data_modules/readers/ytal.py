@@ -1,5 +1,6 @@
-"""y-tal's HDF5 captures (github.com/diegoroyo/tal), as its documentation and files show them; `ytal_write`
-writes them.
+"""y-tal's HDF5 captures (github.com/diegoroyo/tal), as its documentation and files show them.
+
+`ytal_write` writes them.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
 NAME = "ytal"
-DESCRIPTION = "y-tal .hdf5, any scan: bin length and wall points (m) from the file, expected values unless written by this project"
+DESCRIPTION = (
+    "y-tal .hdf5, any scan: bin length and wall points (m) from the file, "
+    "expected values unless written by this project"
+)
 EXPECTS = "H, delta_t, sensor_grid_xyz and laser_grid_xyz"
 OPTIONS = COMMON_OPTIONS | {"raw_scale"}
 _AXES = {T_SX_SY: 3, T_LX_LY_SX_SY: 5, T_SI: 2, T_LI_SI: 3}
@@ -27,15 +31,28 @@ _KEPT_TEXT = 16_384
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file holds H, its bin length and both grids of wall points."""
     return contents.has("H", "delta_t", "sensor_grid_xyz", "laser_grid_xyz")
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """The file's own coordinates, turned only where its wall does not face +z.
+    """A y-tal file as a capture, in its own coordinates; turned only where its wall does not face +z.
 
     Where the times include laser → wall and wall → sensor, those ways are taken off each spot by whole bins.
     Where the values carry tal's raw scale (said by ``raw_scale``, or by a ``scene_info`` that `tal render`
-    wrote), they are divided by π·cosθ_l/d_l², the irradiance of the laser at each wall point.
+    wrote), they are divided by π·cosθ_l/d_l², the irradiance of the laser at each wall point. What
+    `write_capture` wrote comes back exactly as it was.
+
+    Args:
+        path: of the file.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        the capture; of expected values, unless this project wrote the file.
+
+    Raises:
+        CaptureError: an array is missing or damaged, shapes do not fit H_format, or facts that a correction
+            needs are not there.
     """
     contents = open_contents(path)
     contents.require("H", "delta_t", "sensor_grid_xyz", "laser_grid_xyz")
@@ -48,7 +65,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     t_start = contents.scalar("t_start") if contents.ndim("t_start") >= 0 else 0.0
     text = contents.text("scene_info")
     ours = own_facts(text, path)
-    geometry = {
+    geometry: dict[str, Any] = {
         "laser": laser,
         "sensor": sensor,
         "laser_normal": normals[0],
@@ -64,7 +81,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     ):
         if devices["laser_xyz"] is None or devices["sensor_xyz"] is None:
             raise CaptureError(
-                f"{path.name} counts time from laser to sensor but does not say where they are (laser_xyz, sensor_xyz)"
+                f"{path.name} counts time from laser to sensor but does not say where they are (laser_xyz, "
+                "sensor_xyz)"
             )
         ways = device_distances(devices["laser_xyz"], laser) + device_distances(devices["sensor_xyz"], sensor)
         counts, offset, told = remove_delays(counts, ways / length)
@@ -135,7 +153,8 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
         kind = int(contents.scalar("H_format"))
     if _AXES.get(kind) != values.ndim:
         raise CaptureError(
-            f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: T_Li_Si)"
+            f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: "
+            "T_Li_Si)"
         )
     laser, sensor = (contents.places(key) for key in ("laser_grid_xyz", "sensor_grid_xyz"))
     for key, points in (("laser_grid_xyz", laser), ("sensor_grid_xyz", sensor)):
@@ -151,7 +170,8 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     )
     if not fits or 0 in values.shape:
         raise CaptureError(
-            f"H in {name} has shape {values.shape}, which does not fit {lasers} laser and {sensors} sensor points"
+            f"H in {name} has shape {values.shape}, which does not fit {lasers} laser and {sensors} sensor "
+            "points"
         )
     if kind in (T_SI, T_LI_SI):
         return (
@@ -164,7 +184,8 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
         grids = [points.shape[:2] for points in (laser, sensor)]
         if any(points.ndim != 3 for points in (laser, sensor)) or shape != (*grids[0], *grids[1]):
             raise CaptureError(
-                f"H in {name} has shape {values.shape}, which does not fit laser grid {grids[0]}, sensor grid {grids[1]}"
+                f"H in {name} has shape {values.shape}, which does not fit laser grid {grids[0]}, sensor "
+                f"grid {grids[1]}"
             )
     return laser, sensor, shape, np.ascontiguousarray(values.reshape(len(values), -1).T)
 
@@ -209,8 +230,9 @@ def _device(contents: Contents, name: str) -> np.ndarray | None:
 
 
 def _tal_rendered(text: str) -> bool:
-    """Whether `tal render` wrote this scene_info: top-level keys ``tal_version`` and ``config`` of its YAML,
-    found as text.
+    """Whether `tal render` wrote this scene_info.
+
+    Its YAML has the top-level keys ``tal_version`` and ``config``, which are found as text.
     """
     return all(re.search(rf"^{key}:", text, re.MULTILINE) for key in ("tal_version", "config"))
 
@@ -220,14 +242,16 @@ def _without_raw_scale(
 ) -> tuple[np.ndarray, str]:
     if laser is None:
         raise CaptureError(
-            f"{path.name} has tal's raw scale but no laser_xyz to take it off by; give raw_scale=false to keep it"
+            f"{path.name} has tal's raw scale but no laser_xyz to take it off by; give raw_scale=false to "
+            "keep it"
         )
     way = laser - points
     distance = np.linalg.norm(way, axis=1)
     cosine = (way * normals).sum(axis=1)
     if not (cosine > 1e-6 * distance).all() or distance.min() == 0:
         raise CaptureError(
-            f"{path.name} has tal's raw scale, but its laser at {laser.tolist()} does not face every wall point"
+            f"{path.name} has tal's raw scale, but its laser at {laser.tolist()} does not face every wall "
+            "point"
         )
     factor = np.pi * cosine / distance**3
     told = f"divided by tal's raw scale π·cosθ_l/d_l², {factor.min():.3g} to {factor.max():.3g} over the wall"

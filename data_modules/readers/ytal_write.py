@@ -1,5 +1,6 @@
-"""Write a capture as a y-tal HDF5 file, readable by tal, with this project's further facts inside
-``scene_info``.
+"""Write a capture as a y-tal HDF5 file, readable by tal.
+
+What y-tal has no place for goes into ``scene_info``.
 """
 
 from __future__ import annotations
@@ -27,12 +28,20 @@ _VALUE_TYPES = {"float16", "float32", "float64"}
 
 
 def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> Path:
-    """Write ``capture`` so that reading it back gives the same capture.
+    """Write a capture so that reading it back gives the same capture.
 
     H is float32 as tal expects, so whole counts must not exceed 2²⁴ where they are odd. Scans are stored as
     T_Sx_Sy (confocal and one laser point), T_Lx_Ly_Sx_Sy (exhaustive, and one sensor point as a 1 × 1 sensor
     grid), T_Li_Si (irregular, every laser with every sensor point) or T_Si (irregular pairs). The file
     appears under its name only when complete.
+
+    Args:
+        path: where to.
+        capture: what to write.
+        overwrite: replace a file that is there.
+
+    Returns:
+        the path.
 
     Raises:
         CaptureError: the file exists and ``overwrite`` is false, it cannot be written, counts that float32
@@ -74,8 +83,17 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
 
 
 def own_facts(text: str, path: Path) -> dict[str, Any] | None:
-    """The facts that `write_capture` put into ``scene_info``, as `Capture` arguments and ``dtype``; None for
-    any other text.
+    """The facts that `write_capture` put into ``scene_info``.
+
+    Args:
+        text: the file's ``scene_info``.
+        path: of the file, for messages.
+
+    Returns:
+        `Capture` arguments and ``dtype``, by name; None for any other text.
+
+    Raises:
+        CaptureError: the facts are there and not as they were written.
     """
     line = (
         next((line for line in text.splitlines() if line.startswith(_OURS)), None) if _OURS in text else None

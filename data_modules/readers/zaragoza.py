@@ -1,4 +1,8 @@
-"""The Zaragoza NLOS synthetic dataset (Galindo et al., SIGGRAPH 2019 posters): HDF5 from MATLAB, all bounces."""
+"""The Zaragoza NLOS synthetic dataset: HDF5 from MATLAB, all bounces.
+
+Source: Galindo et al., *A dataset for benchmarking time-resolved non-line-of-sight imaging*, SIGGRAPH 2019
+posters.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +19,8 @@ from nlos_lit.capture.errors import CaptureError
 
 NAME = "zaragoza"
 DESCRIPTION = (
-    "Zaragoza NLOS .hdf5, confocal, single or exhaustive: deltaT and positions (m) from the file, expected values, "
+    "Zaragoza NLOS .hdf5, confocal, single or exhaustive: deltaT and positions (m) from the file, expected "
+    "values, "
     "wall y = 0 facing -y"
 )
 EXPECTS = "data, deltaT, cameraGridPositions and laserGridPositions"
@@ -23,15 +28,25 @@ OPTIONS = COMMON_OPTIONS
 
 
 def matches(contents: Contents) -> bool:
+    """Whether the file holds transients of a rendered wall with its camera grid."""
     return contents.ndim("data") in (4, 5, 6, 7) and contents.has("cameraGridPositions", "deltaT")
 
 
 def read(path: Path, options: ReaderOptions) -> Capture:
-    """Bounces and colours are summed; the ways laser → wall and wall → camera are taken off each spot by
-    whole bins.
+    """A rendered wall as a capture, bounces and colours summed.
 
-    Axes as h5py shows them: ``data`` [colour, T, bounce, sy, sx(, ly, lx)] with positions [3, y, x], or all
-    in reverse.
+    The ways laser → wall and wall → camera are taken off each spot by whole bins. Axes as h5py shows them:
+    ``data`` [colour, T, bounce, sy, sx(, ly, lx)] with positions [3, y, x], or all in reverse.
+
+    Args:
+        path: of the file.
+        options: what the user says, out of OPTIONS.
+
+    Returns:
+        a confocal, single or exhaustive capture of expected values.
+
+    Raises:
+        CaptureError: an array is missing or damaged, or data and positions do not fit together.
     """
     contents = open_contents(path)
     contents.require("data", "deltaT", "cameraGridPositions", "cameraPosition")
@@ -123,8 +138,9 @@ def _grid(contents: Contents, name: str, last: bool) -> np.ndarray:
 def _transients(
     contents: Contents, camera: tuple[int, int], laser: tuple[int, int] | None, last: bool
 ) -> tuple[np.ndarray, int, int]:
-    """``[S, T]`` with spots in the order (laser grid,) camera grid, and how many colours and bounces were
-    summed.
+    """``[S, T]`` with spots in the order (laser grid,) camera grid.
+
+    Also returns how many colours and bounces were summed.
     """
     data = contents.counts("data")
     grids = [*camera, *(laser or ())]
@@ -143,7 +159,8 @@ def _transients(
         data = _sum(data, (-1, -3))
     if tuple(found) != tuple(grids):
         raise CaptureError(
-            f"data in {contents.path.name} scans {tuple(found)} where the grid positions are {tuple(grids)}; they must agree"
+            f"data in {contents.path.name} scans {tuple(found)} where the grid positions are "
+            f"{tuple(grids)}; they must agree"
         )
     return data.reshape(-1, bins), colours, bounces
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from typing import Any
 
 import numpy as np
 
 from data_modules.simulate.mesh import Mesh
 from data_modules.simulate.plan import ScanPlan, wall_grid
-from data_modules.simulate.sensor import SensorModel, direct_pulse, draw_counts, respond
+from data_modules.simulate.sensor import SensorModel, direct_pulse_counts, draw_counts, respond
 from data_modules.simulate.transients import simulate_with_rest
 from data_modules.simulate.truth import Truth, view_from_wall
 from nlos_lit.capture import Capture
@@ -45,6 +46,9 @@ def simulate_capture(
         keep_transients: put the clean and the expected transients into the truth.
         progress: show a progress bar when it takes more than a few seconds.
 
+    Returns:
+        the capture, and what is really there.
+
     Raises:
         UserError: nothing of the scene falls into the time window, or a direct pulse is asked of a scan that
             is not confocal.
@@ -58,10 +62,19 @@ def simulate_capture(
     before = min(before, max(0, int(np.ceil(scan.t_start / scan.bin_length))))
     n_bins = before + scan.n_bins + after
     fine = simulate_with_rest(
-        mesh, laser, point, normals, normals, bin_length=scan.bin_length / oversample, n_bins=n_bins * oversample,
-        t_start=scan.t_start - before * scan.bin_length, wall_albedo=scan.wall_albedo, two_sided=two_sided, detail=detail,
+        mesh,
+        laser,
+        point,
+        normals,
+        normals,
+        bin_length=scan.bin_length / oversample,
+        n_bins=n_bins * oversample,
+        t_start=scan.t_start - before * scan.bin_length,
+        wall_albedo=scan.wall_albedo,
+        two_sided=two_sided,
+        detail=detail,
         progress=progress,
-    )  # fmt: skip
+    )
     window = slice(before, before + scan.n_bins)
 
     def to_bins(transients: np.ndarray) -> np.ndarray:
@@ -72,7 +85,8 @@ def simulate_capture(
     end = scan.t_start + scan.n_bins * scan.bin_length
     if inside == 0:
         raise UserError(
-            f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; change the time window"
+            f"no light of the scene arrives between {scan.t_start:g} and {end:g} m of path; change the "
+            "time window"
         )
     if inside < 0.99:
         log.warning(
@@ -87,10 +101,10 @@ def simulate_capture(
     )
     gate = scan.gate
     if sensor.direct_counts:
-        pulse = direct_pulse(sensor, scan.bin_length, scan.n_bins, scan.t_start)
+        pulse = direct_pulse_counts(sensor, scan.bin_length, scan.n_bins, scan.t_start)
         expected += pulse
         gate = gate or (int(np.flatnonzero(pulse > 0.01).max(initial=-1)) + 1, scan.n_bins)
-    provenance = {
+    provenance: dict[str, Any] = {
         "source": "data_modules.simulate",
         "scan": dataclasses.asdict(scan),
         "sensor": dataclasses.asdict(sensor) | {"kappa": sensor.kappa if np.isfinite(sensor.kappa) else None},
@@ -114,5 +128,5 @@ def simulate_capture(
     )
     lattice = wall_grid(*truth_shape, scan.width, scan.extent_y)
     truth = view_from_wall(mesh, lattice[:, 0, 0], lattice[0, :, 1], two_sided=two_sided)
-    kept = {"clean": clean, "expected": expected} if keep_transients else {}
-    return capture, dataclasses.replace(truth, gain=float(gain), **kept)
+    truth = dataclasses.replace(truth, gain=float(gain))
+    return capture, dataclasses.replace(truth, clean=clean, expected=expected) if keep_transients else truth

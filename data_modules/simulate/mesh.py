@@ -1,4 +1,4 @@
-"""Triangle meshes of the hidden scene: loading, joining, and splitting into patches small enough to simulate."""
+"""Triangle meshes of the hidden scene: loading, joining, and splitting into small patches."""
 
 from __future__ import annotations
 
@@ -24,6 +24,14 @@ class Mesh:
     Raises:
         UserError: shapes disagree, coordinates are not finite, a face names a vertex that is not there,
             albedo outside [0, 1].
+
+    Examples:
+        >>> corners = np.array([[0, 0, 1], [0, 1, 1], [1, 1, 1], [1, 0, 1]])
+        >>> square = Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), np.asarray(0.5))
+        >>> square.area, square.albedo.tolist()
+        (1.0, [0.5, 0.5, 0.5, 0.5])
+        >>> square.face_vectors.tolist()  # towards the wall
+        [[0.0, 0.0, -0.5], [0.0, 0.0, -0.5]]
     """
 
     vertices: np.ndarray
@@ -52,7 +60,16 @@ class Mesh:
 
     @classmethod
     def from_face_albedo(cls, vertices: np.ndarray, faces: np.ndarray, face_albedo: np.ndarray) -> Mesh:
-        """A mesh of constant albedo ``[F]`` on each face; no two faces share a vertex afterwards."""
+        """A mesh of constant albedo on each face; no two faces share a vertex afterwards.
+
+        Args:
+            vertices: ``[V, 3]`` positions, m.
+            faces: ``[F, 3]`` vertex indices.
+            face_albedo: ``[F]`` reflectance in [0, 1].
+
+        Returns:
+            a mesh of 3F vertices.
+        """
         corners = np.asarray(vertices, dtype=np.float64)[np.asarray(faces)].reshape(-1, 3)
         return cls(corners, np.arange(len(corners)).reshape(-1, 3), np.repeat(face_albedo, 3))
 
@@ -95,8 +112,14 @@ def join(*meshes: Mesh) -> Mesh:
 def load_mesh(path: str | Path, albedo: float = 1.0) -> Mesh:
     """Read an OBJ, PLY, STL, OFF or glTF mesh in metres, in the capture's frame.
 
-    Vertex colours, where the file has them, become the albedo (mean of red, green and blue); otherwise
-    ``albedo`` everywhere.
+    Vertex colours, where the file has them, become the albedo (mean of red, green and blue).
+
+    Args:
+        path: of the file.
+        albedo: of a file without vertex colours.
+
+    Returns:
+        the mesh.
 
     Raises:
         UserError: the file is missing or holds no triangles.
@@ -107,22 +130,24 @@ def load_mesh(path: str | Path, albedo: float = 1.0) -> Mesh:
     if not path.is_file():
         raise UserError(f"there is no mesh file {path}; give an OBJ or PLY file")
     with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
-        read = o3d.io.read_triangle_mesh(str(path))
+        read = o3d.io.read_triangle_mesh(path)
     if not read.has_triangles():
         raise UserError(
             f"{path} holds no triangles that can be read; give an OBJ or PLY file of a triangle mesh"
         )
-    values = np.asarray(read.vertex_colors).mean(axis=1) if read.has_vertex_colors() else albedo
+    coloured = read.has_vertex_colors()
+    values = np.asarray(read.vertex_colors).mean(axis=1) if coloured else np.asarray(albedo)
     return Mesh(np.asarray(read.vertices), np.asarray(read.triangles), values)
 
 
 def subdivide(mesh: Mesh, longest_edge: Callable[[np.ndarray], np.ndarray]) -> Mesh:
-    """Halve faces at their longest edge until none is longer than allowed; area and shape stay exactly the
-    same.
+    """Halve faces at their longest edge until none is longer than allowed.
+
+    Area and shape stay exactly the same.
 
     Args:
         mesh: any mesh; faces without area are dropped.
-        longest_edge: allowed edge length ``[F]`` of faces whose centroids ``[F, 3]`` it is given.
+        longest_edge: allowed edge length ``[F]`` of faces whose centroids ``[F, 3]`` it is given, m.
 
     Returns:
         a mesh whose neighbouring faces may meet in the middle of an edge, which a sum over faces does not
@@ -133,9 +158,8 @@ def subdivide(mesh: Mesh, longest_edge: Callable[[np.ndarray], np.ndarray]) -> M
     vertices, albedo, done = mesh.vertices, mesh.albedo, []
     while len(faces):
         corners = vertices[faces]
-        edges = np.linalg.norm(
-            corners - np.roll(corners, -1, axis=1), axis=2
-        )  # edge i joins corners i and i + 1
+        # Edge i joins corners i and i + 1.
+        edges = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
         longest = edges.argmax(axis=1)
         split = edges.max(axis=1) > longest_edge(corners.mean(axis=1))
         done.append(faces[~split])

@@ -12,8 +12,20 @@ KINDS = ("confocal", "single", "exhaustive")
 
 
 def wall_grid(nx: int, ny: int, width: float, height: float) -> np.ndarray:
-    """``[nx, ny, 3]`` centres of the cells of a wall ``width × height`` m around the origin, in the plane z =
-    0.
+    """Centres of the cells of a wall around the origin, in the plane z = 0.
+
+    Args:
+        nx: cells along x.
+        ny: cells along y.
+        width: extent of the wall along x, m.
+        height: extent along y, m.
+
+    Returns:
+        ``[nx, ny, 3]`` points, m.
+
+    Examples:
+        >>> wall_grid(2, 1, 1.0, 1.0).tolist()
+        [[[-0.25, 0.0, 0.0]], [[0.25, 0.0, 0.0]]]
     """
     x = width * ((np.arange(nx) + 0.5) / nx - 0.5)
     y = height * ((np.arange(ny) + 0.5) / ny - 0.5)
@@ -38,6 +50,19 @@ class ScanPlan:
         gate: bins that may be fitted, half-open; None means all, or those after the direct pulse where there
             is one.
         wall_albedo: reflectance of the wall.
+
+    Raises:
+        UserError: an unknown kind of scan, or a number that is not positive.
+
+    Examples:
+        >>> plan = ScanPlan("single", nx=2, ny=1, fixed_point=(0.1, 0.2))
+        >>> plan.scan_shape, plan.extent_y
+        ((2, 1), 1.0)
+        >>> laser, sensor = plan.points()
+        >>> laser.tolist()
+        [[0.1, 0.2, 0.0], [0.1, 0.2, 0.0]]
+        >>> sensor.tolist()
+        [[-0.25, 0.0, 0.0], [0.25, 0.0, 0.0]]
     """
 
     kind: str = "confocal"
@@ -63,10 +88,12 @@ class ScanPlan:
 
     @property
     def extent_y(self) -> float:
+        """Extent of the scanned wall along y, m."""
         return self.width if self.height is None else self.height
 
     @property
     def scan_shape(self) -> tuple[int, ...]:
+        """``(nx, ny)``, or ``(nx, ny, nx, ny)`` for an exhaustive scan."""
         return (self.nx, self.ny) * (2 if self.kind == "exhaustive" else 1)
 
     def points(self) -> tuple[np.ndarray, np.ndarray]:

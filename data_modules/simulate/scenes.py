@@ -26,17 +26,31 @@ def plate(
     turn_y: float = 0,
     albedo: float = 1,
 ) -> Mesh:
-    """A flat rectangle, ``width`` along x and ``height`` along y, turned about its centre: ``turn_x``, then
-    ``turn_y``, rad.
+    """A flat rectangle, turned about its centre.
+
+    Args:
+        centre: (x, y, z), m.
+        width: extent along x before it is turned, m.
+        height: extent along y, m.
+        turn_x: angle about x, done first, rad.
+        turn_y: angle about y, rad.
+        albedo: reflectance.
+
+    Returns:
+        two faces that look to the wall unless turned away.
+
+    Examples:
+        >>> mesh = plate((0.0, 0.0, 0.5), width=0.2, height=0.4)
+        >>> round(mesh.area, 9), mesh.face_vectors[0].round(9).tolist()
+        (0.08, [0.0, 0.0, -0.04])
     """
     x, y = width / 2, height / 2
     corners = np.array([[-x, -y, 0], [-x, y, 0], [x, y, 0], [x, -y, 0]])
     cx, sx, cy, sy = np.cos(turn_x), np.sin(turn_x), np.cos(turn_y), np.sin(turn_y)
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     about_y = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
-    return Mesh(
-        corners @ (about_y @ about_x).T + np.asarray(centre), np.array([[0, 1, 2], [0, 2, 3]]), albedo
-    )
+    turned = corners @ (about_y @ about_x).T + np.asarray(centre)
+    return Mesh(turned, np.array([[0, 1, 2], [0, 2, 3]]), np.asarray(albedo))
 
 
 def sphere(
@@ -47,8 +61,17 @@ def sphere(
     opening: float = np.pi,
     albedo: float = 1.0,
 ) -> Mesh:
-    """A sphere of latitude rings about the pole nearest the wall, out to the polar angle ``opening`` (π/2: a
-    dome).
+    """A sphere of latitude rings about the pole nearest the wall.
+
+    Args:
+        centre: (x, y, z), m.
+        radius: m.
+        rings: from pole to ``opening``; there are twice as many segments around.
+        opening: polar angle at which the sphere ends, rad (π/2: a dome).
+        albedo: reflectance.
+
+    Returns:
+        faces that look outwards.
     """
     segments = 2 * rings
     polar = np.linspace(0, opening, rings + 1)[:, None]
@@ -61,7 +84,7 @@ def sphere(
     a, b = i * segments + j, i * segments + (j + 1) % segments
     c, d = b + segments, a + segments
     faces = np.concatenate([np.stack([a, b, c], axis=1)[i > 0], np.stack([a, c, d], axis=1)])
-    return Mesh(unit.reshape(-1, 3) * radius + np.asarray(centre), faces, albedo)
+    return Mesh(unit.reshape(-1, 3) * radius + np.asarray(centre), faces, np.asarray(albedo))
 
 
 def strokes(
@@ -82,6 +105,9 @@ def strokes(
         bevel: how far the outermost ``cell`` leans back, m.
         cell: grid of the outline, m.
         albedo: reflectance.
+
+    Returns:
+        faces that look to the wall, two a cell.
     """
     ends = np.concatenate(lines)
     low = ends.min(axis=0) - stroke / 2
@@ -96,9 +122,8 @@ def strokes(
             inside |= across & (np.abs(offset @ along) <= np.linalg.norm(end - start) / 2)
         inside |= (np.linalg.norm(centres[:, :, None] - line, axis=3) <= stroke / 2).any(axis=2)
     padded = np.pad(inside, 1)
-    rim = ~(
-        padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1]
-    )  # grid corners that touch the outside
+    # Grid corners that touch the outside.
+    rim = ~(padded[1:, 1:] & padded[:-1, 1:] & padded[1:, :-1] & padded[:-1, :-1])
     corner = low + cell * np.stack(np.meshgrid(*(np.arange(n + 1) for n in shape), indexing="ij"), axis=2)
     vertices = np.concatenate([corner, (depth + bevel * rim)[..., None]], axis=2).reshape(-1, 3)
     i, j = np.nonzero(inside)
@@ -106,15 +131,15 @@ def strokes(
     b, c, d = a + shape[1] + 1, a + shape[1] + 2, a + 1
     faces = np.concatenate([np.stack([a, d, c], axis=1), np.stack([a, c, b], axis=1)])
     used, faces = np.unique(faces, return_inverse=True)
-    return Mesh(vertices[used], faces.reshape(-1, 3), albedo)
+    return Mesh(vertices[used], faces.reshape(-1, 3), np.asarray(albedo))
 
 
 def default_scene() -> Mesh:
-    """The embedded default: a bevelled letter F (albedo 0.5, z = 0.5 m) and, behind its lower right, a dome
-    (albedo 0.9).
+    """The embedded default: a bevelled letter F and, behind its lower right, a dome.
 
-    It reads as an F from the wall, where +x is to the left. Nothing about it is symmetric in x or y. The dome
-    reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall.
+    The F has albedo 0.5 and lies at z = 0.5 m; it reads as an F from the wall, where +x is to the left. The
+    dome has albedo 0.9 and reaches from z = 0.68 to 0.86 m; the F hides it from part of the wall. Nothing is
+    symmetric in x or y.
     """
     f = [np.array([[-0.26, -0.28], [-0.26, 0.26], [0.10, 0.26]]), np.array([[-0.26, 0.04], [0.02, 0.04]])]
     letter = strokes(

@@ -37,10 +37,14 @@ LONG_SECONDS = 5.0  # above this a progress bar is shown
 
 @dataclass(frozen=True)
 class Work:
-    """What a simulation costs: ``patches`` after splitting, (spot, patch) ``pairs``, rough ``seconds`` and
-    peak ``bytes``.
+    """What a simulation costs.
 
-    ``keep_legs``: the legs of all wall points are computed once, because spots share them (exhaustive scans).
+    Args:
+        patches: faces after splitting.
+        pairs: of spot and patch.
+        seconds: rough, on one ordinary core.
+        bytes: at the peak.
+        keep_legs: the legs of all wall points are computed once, because spots share them (exhaustive scans).
     """
 
     patches: int
@@ -93,7 +97,13 @@ class Patches:
     def legs(
         self, points: np.ndarray, normals: np.ndarray, two_sided: bool, occlusion: bool
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One leg of the path: from wall points ``[U, 3]`` with normals ``[U, 3]`` to all patches.
+        """One leg of the path: from wall points to all patches.
+
+        Args:
+            points: ``[U, 3]`` wall points, m.
+            normals: ``[U, 3]`` unit wall normals there.
+            two_sided: faces reflect from both sides.
+            occlusion: faces hide what is behind them.
 
         Returns:
             signed factor cosθ_wall cosθ_patch / d² of every patch ``[U, P]``, 1/m², zero where unlit and
@@ -156,9 +166,20 @@ def simulate_transients(
         MemoryBudgetError: the result and its work space do not fit this machine's free memory.
     """
     histogram = simulate_with_rest(
-        mesh, laser, sensor, laser_normal, sensor_normal, bin_length=bin_length, n_bins=n_bins, t_start=t_start,
-        wall_albedo=wall_albedo, two_sided=two_sided, occlusion=occlusion, detail=detail, progress=progress,
-    )  # fmt: skip
+        mesh,
+        laser,
+        sensor,
+        laser_normal,
+        sensor_normal,
+        bin_length=bin_length,
+        n_bins=n_bins,
+        t_start=t_start,
+        wall_albedo=wall_albedo,
+        two_sided=two_sided,
+        occlusion=occlusion,
+        detail=detail,
+        progress=progress,
+    )
     return histogram[:, 1:-1]
 
 
@@ -178,8 +199,31 @@ def simulate_with_rest(
     detail: float = 1.0,
     progress: bool = False,
 ) -> np.ndarray:
-    """As `simulate_transients`, ``[S, T + 2]``: the first and the last column hold what falls before and
-    after the bins.
+    """As `simulate_transients`, with what falls before and after the bins.
+
+    Args:
+        mesh: the hidden scene.
+        laser: ``[S, 3]`` lit wall points, m.
+        sensor: ``[S, 3]`` observed wall points, m.
+        laser_normal: ``[S, 3]`` unit wall normals at ``laser``.
+        sensor_normal: ``[S, 3]`` the same at ``sensor``.
+        bin_length: optical path of one bin, m.
+        n_bins: number of bins T.
+        t_start: path length at which bin 0 begins, m.
+        wall_albedo: reflectance of the wall.
+        two_sided: faces reflect from both sides.
+        occlusion: faces hide what is behind them.
+        detail: 2 halves the patches' edges.
+        progress: show a progress bar when it takes more than a few seconds.
+
+    Returns:
+        ``[S, T + 2]`` radiance per bin and unit laser power, 1/(m² sr); the first column holds what falls
+        before the bins, the last what falls after them.
+
+    Raises:
+        CaptureError: points and normals are not ``[S, 3]`` each.
+        UserError: a number that must be positive is not, or no face is seen from any wall point.
+        MemoryBudgetError: it does not fit this machine's free memory.
     """
     laser, sensor, laser_normal, sensor_normal = (
         np.asarray(a, dtype=np.float64) for a in (laser, sensor, laser_normal, sensor_normal)
@@ -236,7 +280,8 @@ def simulate_with_rest(
         histogram[block] = spread_triangles(energy, bins, patches.mesh.faces, n_bins)
     if not histogram.any():
         raise UserError(
-            "no face of the mesh is turned towards the wall and visible from it; flip its faces or use two_sided"
+            "no face of the mesh is turned towards the wall and visible from it; flip its faces or use "
+            "two_sided"
         )
     return histogram
 
@@ -253,6 +298,13 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
     Returns:
         ``[B, T + 2]``, what falls before bin 0 in column 0 and what falls after the last in the last; rows
         sum to ``energy``'s.
+
+    Examples:
+        A triangle whose corners arrive at 0, 1 and 2 bins: its density is a triangle over two bins.
+
+        >>> corners = np.array([[0, 1, 2]])
+        >>> spread_triangles(np.array([[1.0]]), np.array([[0.0, 1.0, 2.0]]), corners, n_bins=3).tolist()
+        [[0.0, 0.5, 0.5, 0.0, 0.0]]
     """
     n_rows, n_vertices = bins.shape
     row, patch = np.nonzero(energy > 0)
@@ -289,7 +341,19 @@ def spread_triangles(energy: np.ndarray, bins: np.ndarray, faces: np.ndarray, n_
 def work(
     mesh: Mesh, laser: np.ndarray, sensor: np.ndarray, *, bin_length: float, n_bins: int, detail: float = 1.0
 ) -> Work:
-    """What `simulate_transients` of these arguments would cost."""
+    """What `simulate_transients` of these arguments would cost.
+
+    Args:
+        mesh: the hidden scene.
+        laser: ``[S, 3]`` lit wall points, m.
+        sensor: ``[S, 3]`` observed wall points, m.
+        bin_length: optical path of one bin, m.
+        n_bins: number of bins.
+        detail: 2 halves the patches' edges.
+
+    Returns:
+        patches, pairs, time and memory.
+    """
     points = np.concatenate([laser, sensor])
     return _work(
         Patches(mesh, points, bin_length, detail), len(laser), len(np.unique(points, axis=0)), n_bins

@@ -41,7 +41,17 @@ class Truth:
 
 
 def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool = False) -> Truth:
-    """Look at ``mesh`` from the wall along z through a lattice ``x`` × ``y``."""
+    """Look at a mesh from the wall along z.
+
+    Args:
+        mesh: the hidden scene.
+        x: ``[nx]`` lattice through which to look, m.
+        y: ``[ny]`` lattice, m.
+        two_sided: faces reflect from both sides; otherwise their backs are black.
+
+    Returns:
+        depth, normals and albedo of the first surface met.
+    """
     start = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((len(x), len(y)))], axis=2).reshape(-1, 3)
     distance, face, weights = Occluder(mesh).first_hit(start, np.broadcast_to([0.0, 0.0, 1.0], start.shape))
     hit = np.isfinite(distance)
@@ -69,8 +79,14 @@ def view_from_wall(mesh: Mesh, x: np.ndarray, y: np.ndarray, *, two_sided: bool 
 
 
 def save_truth(path: str | Path, truth: Truth) -> None:
-    """Write HDF5: ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and the
+    """Write the truth as HDF5.
+
+    The file holds ``depth``, ``normal``, ``albedo`` ``[nx, ny(, 3)]``, ``x``, ``y``, ``mesh/…`` and the
     transients, if any.
+
+    Args:
+        path: where to; a file there is replaced.
+        truth: what to write.
     """
     with h5py.File(path, "w") as file:
         for name in ("x", "y", "depth", "normal", "albedo", "clean", "expected"):
@@ -84,8 +100,13 @@ def save_truth(path: str | Path, truth: Truth) -> None:
 
 
 def load_truth(path: str | Path) -> Truth:
-    """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y`` (nothing there:
-    -1 or NaN).
+    """Read `save_truth`'s file, or one that has only ``depth``, ``normal``, ``x`` and ``y``.
+
+    Args:
+        path: of the file; where there is nothing, its depth is -1, 0 or NaN.
+
+    Returns:
+        the truth, NaN where there is nothing; albedo 1 where the file says none.
 
     Raises:
         UserError: no such file, not HDF5, or a key is missing.

@@ -17,15 +17,21 @@ class Occluder:
     def __init__(self, mesh: Mesh) -> None:
         import open3d as o3d
 
-        self._tensor = o3d.core.Tensor
+        self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
             self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.faces.astype(np.uint32))
         )
 
     def blocked(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-        """``[N]`` True where something lies between ``start`` and ``end`` ``[N, 3]``; both should be clear of
-        the surface.
+        """Whether something lies between two points; both should be clear of the surface.
+
+        Args:
+            start: ``[N, 3]`` points, m.
+            end: ``[N, 3]`` points, m.
+
+        Returns:
+            ``[N]`` True where the way is blocked.
         """
         rays = np.empty((len(start), 6), dtype=np.float32)
         rays[:, :3] = start
@@ -35,7 +41,11 @@ class Occluder:
     def first_hit(
         self, start: np.ndarray, direction: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """First surface met from ``start`` along ``direction`` ``[N, 3]``.
+        """First surface met along a ray.
+
+        Args:
+            start: ``[N, 3]`` points, m.
+            direction: ``[N, 3]`` vectors of any length.
 
         Returns:
             distance ``[N]`` in units of ``direction`` (infinite where nothing is met), face index ``[N]`` and

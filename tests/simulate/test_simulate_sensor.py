@@ -10,7 +10,7 @@ from scipy.stats import exponnorm
 
 from data_modules.simulate.sensor import (
     SensorModel,
-    direct_pulse,
+    direct_pulse_counts,
     draw_counts,
     respond,
     response_cdf,
@@ -84,7 +84,7 @@ def test_response_is_causal_convolution_at_the_right_bin():
 
 def test_direct_pulse_sits_at_path_zero():
     sensor = SensorModel(sigma=0.01, kappa=50.0, direct_counts=1000.0)
-    pulse = direct_pulse(sensor, 0.01, 300, -0.5)
+    pulse = direct_pulse_counts(sensor, 0.01, 300, -0.5)
     t = -0.5 + 0.01 * (np.arange(300) + 0.5)
     assert pulse.sum() == pytest.approx(1000, rel=1e-9)
     assert (pulse * t).sum() / 1000 == pytest.approx(1 / 50, rel=1e-3)
