@@ -20,8 +20,9 @@ BLOCK_PATHS = 400_000  # so that a block's arrays stay in the cache
 
 @dataclass(frozen=True)
 class Elements:
-    """Centres ``[N, 3]`` m, unit normals ``[N, 3]``, areas ``[N]`` m² and albedos ``[N]`` of a surface cut
-    small.
+    """A surface cut small.
+
+    Centres ``[N, 3]`` m, unit normals ``[N, 3]``, areas ``[N]`` m² and albedos ``[N]``.
     """
 
     centre: np.ndarray
@@ -40,8 +41,9 @@ class Elements:
 
 @dataclass(frozen=True)
 class Legs:
-    """Both legs of the paths of some spots: ``to_laser`` and ``to_sensor`` are unit vectors from the element,
-    3 × ``[B, N]``.
+    """Both legs of the paths of some spots.
+
+    ``to_laser`` and ``to_sensor`` are unit vectors from the element, 3 × ``[B, N]``.
     """
 
     d1: np.ndarray
@@ -126,10 +128,9 @@ def third_bounce(
     axis: Axis,
     weights: tuple[Callable[[Legs], np.ndarray], ...] = (),
 ) -> np.ndarray:
-    """``[S, n]`` light per fine bin; ``seen`` ``[S, N]`` of both legs together, ``weights`` give a factor
-    ``[B, N]`` each.
+    """``[S, n]`` light of laser → wall → element → wall → sensor per fine bin; the wall's normals are +z.
 
-    The wall's normals are +z.
+    ``seen`` ``[S, N]`` is of both legs together, ``weights`` give a factor ``[B, N]`` each.
     """
     same = laser is sensor
     light = np.zeros((len(laser), axis.n))
@@ -149,8 +150,9 @@ def third_bounce(
 
 
 def fourth_bounce(elements: Elements, wall: np.ndarray, seen: np.ndarray, axis: Axis) -> np.ndarray:
-    """``[S, n]`` light of laser → wall → element a → element b → wall → sensor in a confocal scan; elements
-    see each other.
+    """``[S, n]`` light of laser → wall → element a → element b → wall → sensor in a confocal scan.
+
+    Elements see each other.
     """
     gap = elements.centre[None] - elements.centre[:, None]
     distance = np.linalg.norm(gap, axis=2)

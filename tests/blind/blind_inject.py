@@ -1,7 +1,7 @@
-"""What can be hidden in a capture of the blind test, each by formulas of its own; the light's way is in
-`Work.expected`.
+"""What can be hidden in a capture of the blind test, each by formulas of its own.
 
-Each injector takes the `Work` and a strength and returns the true values of the reported quantities.
+The light's way is in `Work.expected`. Each injector takes the `Work` and a strength and returns the true
+values of the reported quantities.
 """
 
 from __future__ import annotations
@@ -263,7 +263,7 @@ def moving_object(work: Work, lift: float) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Kind:
-    """An injector, its four strengths from just detectable to gross, and the axis on which an unknown shows."""
+    """An injector, its strengths from just detectable to gross, and the axis on which an unknown shows."""
 
     inject: Callable[[Work, float], dict[str, float]]
     ladder: tuple[float, float, float, float]

@@ -134,8 +134,9 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
 def oracle_gain(
     truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
 ) -> Comparison:
-    """Nats on the select spots of the better of two fits that are told the true effects: warm-started, and
-    from new seeds.
+    """Nats on the select spots of the better of two fits that are told the true effects.
+
+    One starts from the fit that is there, one from new seeds.
     """
     split = split_spots(capture)
     candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]

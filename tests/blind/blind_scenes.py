@@ -29,8 +29,9 @@ PAD = 16  # bins beyond either end of the window, from which light can be moved 
 
 
 def corner() -> Mesh:
-    """Two plates that face each other and the wall, like the inside of an opened book: much light bounces
-    twice.
+    """Two plates that face each other and the wall, like the inside of an opened book.
+
+    Much light bounces twice.
     """
     left = plate((0.18, 0.03, 0.76), 0.44, 0.40, turn_y=np.deg2rad(42), albedo=0.9)
     right = plate((-0.15, -0.02, 0.78), 0.34, 0.46, turn_y=np.deg2rad(-36), albedo=0.6)
@@ -59,8 +60,9 @@ class Window:
 
 @dataclass(frozen=True)
 class Plan:
-    """How a scene is made: ``mesh`` and ``width`` (m) of the scanned wall, or the name of a ``render``;
-    element ``size``, m.
+    """How a scene is made.
+
+    ``mesh`` and ``width`` (m) of the scanned wall, or the name of a ``render``; element ``size``, m.
     """
 
     window: Window
@@ -119,8 +121,9 @@ class Scene:
         wall: np.ndarray | None = None,
         lift: float = 0.0,
     ) -> np.ndarray:
-        """Light of an own scene with weights on its paths, true ``wall`` points, or the scene ``lift`` m
-        nearer to the wall.
+        """Light of an own scene with weights on its paths, true ``wall`` points, or lifted.
+
+        A scene that is lifted lies ``lift`` m nearer to the wall.
         """
         wall = self.laser if wall is None else wall
         return third_bounce(
@@ -128,8 +131,9 @@ class Scene:
         )
 
     def apart(self, sensor: np.ndarray) -> np.ndarray:
-        """Light of an own scene where the sensor looks at ``sensor`` ``[S, 3]`` instead of at the laser's
-        points.
+        """Light of an own scene where the sensor looks at points of its own.
+
+        They are ``sensor`` ``[S, 3]``, instead of the laser's.
         """
         seen = self.seen & sight(self.mesh, self.elements, sensor)
         return third_bounce(self.elements, self.laser, sensor, seen, self.window.fine)
@@ -187,7 +191,7 @@ def _render(name: str, plan: Plan) -> Scene:
 
 
 def refine(light: np.ndarray, t_start: float, bin_length: float, axis: Axis) -> np.ndarray:
-    """Light ``[S, T]`` in bins as light on a fine axis ``[S, n]``; nothing becomes negative, energies stay."""
+    """Light ``[S, T]`` in bins as light on a fine axis ``[S, n]``; nothing is negative, energies stay."""
     edges = t_start + bin_length * np.arange(light.shape[1] + 1)
     total = np.concatenate([np.zeros((len(light), 1)), np.cumsum(light, axis=1, dtype=np.float64)], axis=1)
     at = PchipInterpolator(edges, total, axis=1)(np.clip(axis.edges, edges[0], edges[-1]))

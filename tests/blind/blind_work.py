@@ -1,5 +1,6 @@
-"""A measurement in the making, on which the hidden effects of the blind test act; expected values on a fine
-time axis.
+"""A measurement in the making, on which the hidden effects of the blind test act.
+
+It holds expected values on a fine time axis.
 """
 
 from __future__ import annotations
@@ -89,8 +90,9 @@ class Work:
 
 
 def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: float) -> np.ndarray:
-    """Light ``[S, n]`` at path L brought to L + delay + stretch·(L - middle): the cumulative light is
-    interpolated linearly.
+    """Light ``[S, n]`` at path L brought to L + delay + stretch·(L - middle).
+
+    The cumulative light is interpolated linearly.
     """
     if not delay.any() and stretch == 0:
         return light
@@ -103,8 +105,9 @@ def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: f
 
 
 def wave(work: Work) -> np.ndarray:
-    """``[S]`` smooth random function of the scan order, mean 0, peak to peak 1: three slow cosines, never
-    just a slope.
+    """``[S]`` smooth random function of the scan order, mean 0, peak to peak 1.
+
+    It is made of three slow cosines and is never just a slope.
     """
     u = (work.rank + 1) / 2
     size = work.rng.uniform(0.5, 1.0, 3) * work.rng.choice([-1, 1], 3) / [1.0, 1.2, 2.0]

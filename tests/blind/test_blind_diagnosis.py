@@ -1,5 +1,6 @@
-"""Captures with something hidden in them are diagnosed from their files alone; benchmarks/blind.py does the
-same at length.
+"""Captures with something hidden in them are diagnosed from their files alone.
+
+benchmarks/blind.py does the same at length.
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated
 QUICK = CriticismSettings(numerics=False, spots=256, steps=30, rivals=2, finalists=1, far_off=9.0, most=1)
 WHOLE = CriticismSettings(numerics=False)
 HARD = {
-    "retroreflection": "without cosines the counts do not tell normals, and the base breaks (docs/criticism.md)",
+    "retroreflection": "without cosines the counts do not tell normals; the base breaks (docs/criticism.md)",
     "wall_tilt": "a tilted wall and a turned scene are the same to second order (docs/blind.md)",
-    "clock_scale": "0.05 % of its information is retained, and the base's own misfit is larger (docs/blind.md)",
+    "clock_scale": "0.05 % of its information is retained; the base's own misfit is larger (docs/blind.md)",
     "laser_sensor_baseline": "surfels lean with it, and the fit is as good (docs/blind.md)",
 }
 
 
 def check(outcome: Outcome) -> None:
-    """What was hidden is named first, alone or in its group; nothing is named where nothing known is hidden."""
+    """What was hidden is named first, alone or in its group; where nothing known is hidden, nothing is."""
     if outcome.unknown:
         assert outcome.named == [], "something outside the registry was given a name of the registry"
         assert outcome.unexplained == outcome.axis
@@ -62,16 +63,18 @@ def test_what_no_effect_explains_is_called_unexplained():
 
 @pytest.mark.slow
 def test_a_gap_in_the_time_codes_is_not_called_a_ripple():
-    """Five codes lose 90 %: a ripple with half a period there gains most by far, but its strength is not the
-    same everywhere.
+    """Five codes lose 90 %.
+
+    A ripple with half a period there gains most by far, but its strength is not the same everywhere.
     """
     check(run_case(Spec("sphere_before_plate", ("missing_codes",), (3,), 500, 1), QUICK, oracle=False))
 
 
 @pytest.mark.slow
 def test_a_detector_that_saturates_is_not_called_a_dark_wall():
-    """It loses most where the scene is bright: a smooth map over the wall explains it, but the map follows
-    the count rate.
+    """It loses most where the scene is bright.
+
+    A smooth map over the wall explains it, but the map follows the count rate.
     """
     check(run_case(Spec("default", ("saturation",), (3,), 1500, 4108), QUICK, oracle=False))
 

@@ -1,4 +1,7 @@
-"""Hidden effects of time, response, gain, background and counting, and those outside the registry, by hand."""
+"""Hidden effects of time, response, gain, background and counting, and those outside the registry.
+
+Each is checked by hand.
+"""
 
 import numpy as np
 import pytest

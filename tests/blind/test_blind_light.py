@@ -56,10 +56,9 @@ def test_third_bounce_of_one_element_by_hand():
 def test_fourth_bounce_of_one_pair_by_hand():
     # Elements at (±0.3, 0, 0.4) face each other and the wall at 45°; the spot lies between them.
     half = np.sqrt(0.5)
-    pair = Elements(
-        np.array([[0.3, 0, 0.4], [-0.3, 0, 0.4]]), np.array([[-half, 0, -half], [half, 0, -half]]), np.full(2, 1e-4),
-        np.array([0.9, 0.6]),
-    )  # fmt: skip
+    places = np.array([[0.3, 0, 0.4], [-0.3, 0, 0.4]])
+    normals = np.array([[-half, 0, -half], [half, 0, -half]])
+    pair = Elements(places, normals, np.full(2, 1e-4), np.array([0.9, 0.6]))
     light = fourth_bounce(pair, np.zeros((1, 3)), np.ones((1, 2), bool), Axis(0.0, 0.01, 300))
     leg = 0.8 * (0.6 + 0.8) * half / 0.25
     assert light.sum() == pytest.approx(2 * leg**2 * half**2 / 0.36 * 0.9 * 0.6 * 1e-8 / np.pi**4)

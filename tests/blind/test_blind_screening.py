@@ -1,4 +1,7 @@
-"""Every effect once: hidden in a capture, it is what the first screening of a quickly fitted base asks for."""
+"""Every effect once: it is what the first screening of a quickly fitted base asks for.
+
+It is hidden in a capture of its own.
+"""
 
 from __future__ import annotations
 

@@ -39,8 +39,9 @@ def test_parallel_plates():
 
 
 def test_missing_regions_count_from_the_truth_only():
-    """Half of the plate is reconstructed, perfectly: from the missing half the distance grows evenly from 0
-    to 0.2 m.
+    """Half of the plate is reconstructed, perfectly.
+
+    From the missing half the distance grows evenly from 0 to 0.2 m.
     """
     truth = plate((0, 0, 0.6), 0.4, 0.4)
     half = plate((-0.1, 0, 0.6), 0.2, 0.4)

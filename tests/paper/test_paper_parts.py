@@ -1,6 +1,4 @@
-"""What experiments measure with, by hand: separation, thinning, settling, scores; what a workspace keeps and
-refuses.
-"""
+"""What experiments measure with, by hand, and what a workspace keeps and refuses."""
 
 from __future__ import annotations
 
@@ -153,7 +151,8 @@ def test_missing_data_are_named(tmp_path):
 
 
 def test_what_is_written_by_hand_stays():
-    text = f"# Results\nby hand\n{begin('a')}\nold\n<!-- end -->\nmore by hand\n{begin('b')}\nother\n<!-- end -->\n"
+    text = f"# Results\nby hand\n{begin('a')}\nold\n<!-- end -->\n"
+    text += f"more by hand\n{begin('b')}\nother\n<!-- end -->\n"
     new = replace_part(text, "a", "fresh \\1")
     assert new == text.replace("old", "fresh \\1")
     with pytest.raises(UserError, match="must hold one part between <!-- generated: c -->"):

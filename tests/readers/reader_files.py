@@ -1,5 +1,6 @@
-"""Small asymmetric captures, written in each public format by hand: one bright bin at one place, in a field
-of ones.
+"""Small asymmetric captures, written in each public format by hand.
+
+One bright bin at one place, in a field of ones.
 """
 
 from __future__ import annotations
@@ -41,8 +42,9 @@ def lct(folder: Path) -> Path:
 
 
 def fk(folder: Path, beside: bool = False) -> Path:
-    """2 rows × 4 columns of 2 m × 2 m, bright at the lower row, first column, bin 40 of which 5 are delay
-    (others: 3).
+    """2 rows × 4 columns of 2 m × 2 m, bright at the lower row, first column, bin 40.
+
+    5 of the 40 are delay (others: 3).
     """
     delays = np.full((2, 4), 96.0)
     delays[1, 0] = 160.0
@@ -55,8 +57,9 @@ def fk(folder: Path, beside: bool = False) -> Path:
 
 
 def phasor_field(folder: Path) -> Path:
-    """3 rows × 4 columns 0.02 m apart, bins of 8 ps, bright at the first row, second column; detector at row
-    2, column 4.
+    """3 rows × 4 columns 0.02 m apart, bins of 8 ps, bright at the first row, second column.
+
+    The detector is at row 2, column 4.
     """
     arrays = {
         "rect_data": cube((3, 4, 200), (0, 1, 150), np.float64),
@@ -69,11 +72,10 @@ def phasor_field(folder: Path) -> Path:
 
 
 def zaragoza(folder: Path, exhaustive: bool = False, reverse: bool = False) -> Path:
-    """Wall y = 0 facing -y; x in (-0.4, 0, 0.4), z in (0, 0.4); camera and laser at (0, -0.3, 0), so that
-    ways are 0.3 or 0.5 m.
+    """Wall y = 0 facing -y; x in (-0.4, 0, 0.4), z in (0, 0.4).
 
-    Bright at x = 0, z = 0.4 in bin 150 of 0.01 m. Exhaustive: laser points x in (0, 0.4) at z = 0; bright for
-    the laser at 0.4.
+    Camera and laser are at (0, -0.3, 0), so that ways are 0.3 or 0.5 m. Bright at x = 0, z = 0.4 in bin 150
+    of 0.01 m. Exhaustive: laser points x in (0, 0.4) at z = 0; bright for the laser at 0.4.
     """
     x, z = np.array([-0.4, 0.0, 0.4]), np.array([0.0, 0.4])
     points = np.stack([*np.broadcast_arrays(x[None, :], 0.0, z[:, None])])
@@ -132,15 +134,16 @@ def radiance(path: Path, picture: np.ndarray, run_length: bool) -> Path:
 
 
 def chen(folder: Path, run_length: bool = True) -> Path:
-    """6 frames of 8 × 8 pixels over 2 m × 2 m, bright 0.5 in frame 4, third row, second column, else 0.125."""
+    """6 frames of 8 × 8 pixels over 2 m × 2 m, 0.5 in frame 4, third row, second column, else 0.125."""
     frames = np.full((6, 8, 8), 0.125)
     frames[4, 2, 1] = 0.5
     return radiance(folder / "light-1.hdr", frames.reshape(48, 8), run_length)
 
 
 def ahn(folder: Path, confocal: bool = True) -> Path:
-    """Wall at z = 0.6 of the file, object at its origin; laser points (±0.1, ±0.2, 0.6); bright at (0.1,
-    -0.2), bin 33 of 2 mm.
+    """Wall at z = 0.6 of the file, object at its origin; laser points (±0.1, ±0.2, 0.6).
+
+    Bright at (0.1, -0.2), bin 33 of 2 mm.
     """
     points = np.array([[x, y, 0.6] for y in (0.2, -0.2) for x in (-0.1, 0.1)])
     sensors = points if confocal else np.array([[0.3, 0.1, 0.6]])
@@ -174,8 +177,9 @@ def plain_cube(folder: Path) -> Path:
 
 
 def cid(folder: Path) -> Path:
-    """3 × 2 laser points 0.02 m apart, heights falling; detector at (2, 4); bright at (4, 6), bin 33; bins
-    20–49 full.
+    """3 × 2 laser points 0.02 m apart, heights falling; detector at (2, 4).
+
+    Bright at (4, 6), bin 33; bins 20–49 full.
     """
     points = np.array([[0, a, b] for a in (0, 2, 4) for b in (6, 4)])
     counts = np.zeros((6, 60), dtype=np.uint16)
@@ -189,8 +193,9 @@ def cid(folder: Path) -> Path:
 
 
 def ytal(folder: Path, **changes: object) -> Path:
-    """3 × 2 confocal spots, x in (-0.2, 0, 0.2), y in (-0.1, 0.1), 0.01 m bins from 0.5 m; bright at x = 0.2,
-    y = -0.1, bin 33.
+    """3 × 2 confocal spots, x in (-0.2, 0, 0.2), y in (-0.1, 0.1), 0.01 m bins from 0.5 m.
+
+    Bright at x = 0.2, y = -0.1, bin 33.
     """
     grid = np.stack(np.meshgrid([-0.2, 0.0, 0.2], [-0.1, 0.1], [0.0], indexing="ij"), axis=-1)[
         :, :, 0

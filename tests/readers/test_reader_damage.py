@@ -21,8 +21,9 @@ QUICK = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCh
 
 
 def _outcome(path: Path, options: ReaderOptions | None = None) -> str:
-    """Reads; a `Capture` or a `CaptureError` of one sentence are the only ways out, and the file stays as it
-    is.
+    """What reading comes to: a `Capture`, or a `CaptureError` of one sentence.
+
+    There is no other way out, and the file stays as it is.
     """
     before = path.read_bytes()
     sentence = None

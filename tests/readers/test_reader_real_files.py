@@ -89,8 +89,9 @@ def test_lct_captures(name, sha):
 
 
 def _image(capture, depth: float, step: int, wavelength: float = 0.06) -> np.ndarray:
-    """``[x, y]`` phasor-field back-projection onto 28 × 28 points of a plane, from every ``step``-th spot
-    along both axes.
+    """``[x, y]`` phasor-field back-projection onto 28 × 28 points of a plane.
+
+    It uses every ``step``-th spot along both axes.
     """
     nx, ny = capture.scan_shape
     rows = np.arange(nx * ny).reshape(nx, ny)[::step, ::step].ravel()
@@ -121,8 +122,9 @@ def _seen(image: np.ndarray) -> np.ndarray:
 
 
 def _ratio(seen: np.ndarray, stroke: tuple[slice, slice], gap: tuple[slice, slice]) -> float:
-    """How much brighter a stroke of a letter is than a place that only the mirrored or inverted letter would
-    fill.
+    """How much brighter a stroke of a letter is than a place of its mirror image.
+
+    The place is one that only the mirrored or inverted letter would fill.
     """
     return float(seen[stroke].mean() / seen[gap].mean())
 

@@ -70,8 +70,9 @@ def _capture(kind: str) -> Capture:
 
 
 KINDS = [
-    ("confocal", 1), ("single_laser", 1), ("single_sensor", 2), ("exhaustive", 2), ("paired_grids", 1), ("irregular_confocal", 3),
-    ("irregular_single", 3), ("irregular_single_sensor", 3), ("irregular_pairs", 3), ("irregular_product", 4), ("one_spot", 1),
+    ("confocal", 1), ("single_laser", 1), ("single_sensor", 2), ("exhaustive", 2), ("paired_grids", 1),
+    ("irregular_confocal", 3), ("irregular_single", 3), ("irregular_single_sensor", 3),
+    ("irregular_pairs", 3), ("irregular_product", 4), ("one_spot", 1),
 ]  # fmt: skip
 
 
@@ -91,9 +92,14 @@ def test_round_trip_is_lossless(tmp_path, kind, h_format):
         assert set(file) == TAL_KEYS
         assert not list(file.attrs)
         assert file["H_format"][()].tolist() == [h_format]
-        assert {name: file[name].dtype.name for name in ("H", "H_format", "delta_t", "t_start", "laser_grid_format")} == {
-            "H": "float32", "H_format": "int32", "delta_t": "float64", "t_start": "float64", "laser_grid_format": "int32",
-        }  # fmt: skip
+        kinds = {
+            "H": "float32",
+            "H_format": "int32",
+            "delta_t": "float64",
+            "t_start": "float64",
+            "laser_grid_format": "int32",
+        }
+        assert {name: file[name].dtype.name for name in kinds} == kinds
         assert file["t_accounts_first_and_last_bounces"][()] == np.bool_(False)
         assert file["H"].shape[0] == 17
 

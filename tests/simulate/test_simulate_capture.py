@@ -185,7 +185,7 @@ def test_meshes_face_the_wall_and_close_where_they_should():
 
 
 def test_the_default_scene_is_asymmetric():
-    """Mirroring x, mirroring y or exchanging them changes what is seen over more than a fifth of the surface."""
+    """Mirroring x or y or exchanging them changes what is seen over more than a fifth of the surface."""
     lattice = wall_grid(60, 60, 1.0, 1.0)
     depth = view_from_wall(default_scene(), lattice[:, 0, 0], lattice[0, :, 1]).depth
     seen = np.nan_to_num(depth)
@@ -195,8 +195,9 @@ def test_the_default_scene_is_asymmetric():
 
 def test_mesh_files_are_read_with_their_colours(tmp_path):
     (tmp_path / "two.ply").write_text(
-        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n"
-        "property uchar green\nproperty uchar blue\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
         "0 0 1 255 255 255\n0 1 1 51 51 51\n1 0 1 0 51 102\n3 0 1 2\n"
     )
     mesh = load_mesh(tmp_path / "two.ply")

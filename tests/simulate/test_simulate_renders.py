@@ -31,8 +31,9 @@ def scene(name: str):
 
 
 def read_render(name: str, step: int):
-    """Radiance ``[S, T]``, laser and sensor points ``[S, 3]``, bin length and stated noise, read without the
-    project's readers.
+    """Radiance ``[S, T]``, laser and sensor points ``[S, 3]``, bin length and stated noise.
+
+    They are read without the project's readers.
     """
     with h5py.File(real_file(f"rendered/{name}.hdf5")) as file:
         h = file["H"][()].astype(np.float64)
@@ -61,7 +62,7 @@ def test_agrees_with_an_independent_render_at_its_noise(name, mesh, step):
 
 
 def test_a_transposed_scan_would_be_noticed():
-    """The comparison above can fail: with x and y of the sensor exchanged the error is far above the noise."""
+    """The comparison above can fail: with the sensor's x and y exchanged the error is far above the noise."""
     render, laser, sensor, bin_length, noise = read_render("bunny_single_32_d3", 29)
     normals = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
     ours = simulate_transients(

@@ -40,8 +40,9 @@ def test_one_small_patch_has_the_value_and_bin_of_the_formula():
 
 
 def test_tilted_patch_uses_its_own_normal():
-    """Turned by 30° about y, a patch straight ahead keeps cos 30° on both legs of a confocal path, and its
-    area.
+    """A patch straight ahead, turned by 30° about y, on a confocal path.
+
+    It keeps cos 30° on both legs, and its area.
     """
     angle = math.pi / 6
     flat = transients(plate((0, 0, 0.7), 0.004, 0.004), (0, 0, 0), (0, 0, 0)).sum()
@@ -95,8 +96,9 @@ def test_plane_agrees_with_direct_quadrature_bin_by_bin():
 
 
 def test_sphere_agrees_with_its_one_dimensional_integral():
-    """Confocal, the sphere straight ahead: rings of polar angle θ up to the horizon; also shows that no patch
-    shades itself.
+    """Confocal, the sphere straight ahead: rings of polar angle θ up to the horizon.
+
+    This also shows that no patch shades itself.
     """
     distance, radius = 0.6, 0.25
     theta = np.arccos(radius / distance) * (np.arange(20_000) + 0.5) / 20_000
@@ -186,8 +188,9 @@ def test_sub_bin_shifts_keep_energy_and_centroid(fraction):
 
 
 def test_moving_the_scene_moves_the_centroid_by_twice_as_much():
-    """On axis, far away, a plate moved by a quarter bin arrives half a bin later (up to the 1/d⁴ weighting,
-    here 1e-3).
+    """On axis, far away, a plate moved by a quarter bin arrives half a bin later.
+
+    The 1/d⁴ weighting adds up to 1e-3.
     """
     b = 0.01
     plates = [plate((0, 0, 3.0 + move), 0.5, 0.4, turn_y=0.4) for move in (0, 0.25 * b)]
