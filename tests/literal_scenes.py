@@ -118,8 +118,8 @@ def build(case: Case) -> SimpleNamespace:
     else:
         grid = volume_grid(capture, depth=(0.37, 0.82), depth_pitch=0.021, refine=case.refine)
     bounds = SimpleNamespace(
-        omega_pf=(42.0, 15.0, 70.0), sigma_pf=(0.15, 0.06, 0.3), sigma_ls=(0.03, 0.016, 0.1), I_l=(4.0e4, 1.0, 1e6),
-        kappa_s=(40.0, 5.0, 200.0), eta_s=(8.0, 0.1, 100.0),
+        omega_pf=(42.0, 15.0, 70.0), sigma_pf=(0.15, 0.06, 0.3), sigma_ls=(0.03, 0.016, 0.1),
+        I_l=(4.0e4, 1.0, 1e6), kappa_s=(40.0, 5.0, 200.0), eta_s=(8.0, 0.1, 100.0),
     )  # fmt: skip
     torch.manual_seed(case.seed)
     parameters = {name: BoundedParameter(*values, "unit") for name, values in vars(bounds).items()}
@@ -154,7 +154,8 @@ def build(case: Case) -> SimpleNamespace:
     )
     laser_sensor = LaserSensor(
         bin_length=BIN, n_bins=case.gate[1], sigma_ls=parameters["sigma_ls"], kappa_s=parameters["kappa_s"],
-        intensity=parameters["I_l"], background=parameters["eta_s"], splat_sigma=0.62 if case.subtract else None,
+        intensity=parameters["I_l"], background=parameters["eta_s"],
+        splat_sigma=0.62 if case.subtract else None,
     )  # fmt: skip
     pipeline = Pipeline(capture, phasor, geometry, albedo, renderer, laser_sensor)
     spots = torch.from_numpy(rng.permutation(capture.n_spots)[:3])

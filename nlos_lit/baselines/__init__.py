@@ -30,9 +30,8 @@ METHODS: dict[str, Callable[..., torch.Tensor]] = {
     "fk": fk,
     "rsd": rsd,
 }
-FIELDS: dict[str, Callable[..., torch.Tensor]] = {
-    "dlct": dlct_field
-}  # methods that find the surface's direction as well
+# Methods that find the surface's direction as well.
+FIELDS: dict[str, Callable[..., torch.Tensor]] = {"dlct": dlct_field}
 _BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {
     "bp": bp_bytes,
     "fbp": fbp_bytes,
@@ -46,7 +45,7 @@ _BYTES: dict[str, Callable[[Capture, VolumeGrid], int]] = {
 def reconstruct(
     capture: Capture, grid: VolumeGrid, method: str, *, budget_bytes: int | None = None, **options: Any
 ) -> torch.Tensor:
-    """Runs one of ``METHODS``.
+    """Run one of ``METHODS``.
 
     Args:
         capture: what was measured.
@@ -70,8 +69,23 @@ def reconstruct(
 def reconstruct_directed(
     capture: Capture, grid: VolumeGrid, method: str, *, budget_bytes: int | None = None, **options: Any
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """As :func:`reconstruct`, with the vectors ``[3, nz, nx, ny]`` along the surface's normal of a method in
-    ``FIELDS``.
+    """As :func:`reconstruct`, with the surface's directions where the method finds them.
+
+    Args:
+        capture: what was measured.
+        grid: where to reconstruct.
+        method: a name in ``METHODS``.
+        budget_bytes: memory the method may allocate beyond the capture's counts; None sets no limit.
+        options: of that method, by name.
+
+    Returns:
+        ``[nz, nx, ny]`` float32, nonnegative; and vectors ``[3, nz, nx, ny]`` along the surface's normal of a
+        method in ``FIELDS``, None of the others.
+
+    Raises:
+        UserError: unknown method or option.
+        CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
+        MemoryBudgetError: the estimate is above the budget; nothing was allocated.
     """
     function = _checked(capture, grid, method, budget_bytes, options)
     if method not in FIELDS:
@@ -89,15 +103,23 @@ def _checked(
         raise UserError(f"method {method} has no option {unknown[0]!r}; it takes {', '.join(allowed)}")
     if budget_bytes is not None and (need := estimate_bytes(capture, grid, method)) > budget_bytes:
         raise MemoryBudgetError(
-            f"method {method} needs {need / 2**30:.2f} GiB, above the budget of {budget_bytes / 2**30:.2f} GiB; "
-            f"sum time bins or spots of the capture, make the volume smaller, or raise the budget"
+            f"method {method} needs {need / 2**30:.2f} GiB, above the budget of "
+            f"{budget_bytes / 2**30:.2f} GiB; sum time bins or spots of the capture, make the volume "
+            "smaller, or raise the budget"
         )
     return function
 
 
 def estimate_bytes(capture: Capture, grid: VolumeGrid, method: str) -> int:
-    """Bytes that a method will allocate at its peak, beyond the capture's own counts; allocates nothing of
-    that size.
+    """Bytes that a method will allocate at its peak; allocates nothing of that size.
+
+    Args:
+        capture: what was measured.
+        grid: where to reconstruct.
+        method: a name in ``METHODS``.
+
+    Returns:
+        Bytes, beyond the capture's own counts.
 
     Raises:
         UserError: unknown method.

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
-from nlos_lit.baselines.scan import gated_transients
+from nlos_lit.baselines.inputs import gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid, path_range
@@ -37,6 +37,17 @@ def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Ten
 
     Raises:
         CaptureError: the volume lies outside the gate.
+
+    Examples:
+        One spot, one voxel 0.5 m ahead: the bin with path 1 m.
+
+        >>> import numpy as np
+        >>> spot, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+        >>> counts = np.zeros((1, 20))
+        >>> counts[0, 10] = 7
+        >>> capture = Capture(counts, spot, spot, up, up, bin_length=0.1, t_start=-0.05)
+        >>> bp(capture, VolumeGrid((0.0, 0.0, 0.5), (0.1, 0.1, 0.1), (2, 1, 1)))[:, 0, 0].round()
+        tensor([7., 0.])
     """
     _, longest = path_range(capture, grid)
     transients, start = gated_transients(capture, longest, falloff)
@@ -114,7 +125,15 @@ def fbp(
 
 
 def bp_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`bp` allocates: transients, volume, and one block of positions and distances."""
+    """Bytes that :func:`bp` allocates: transients, volume, and one block of positions and distances.
+
+    Args:
+        capture: of any kind.
+        grid: where to reconstruct.
+
+    Returns:
+        Bytes, beyond the capture's counts.
+    """
     ends = _path_ends(capture)
     columns = _block_columns(grid, ends)
     pairs = max(1, min(_BLOCK // columns, capture.n_spots)) * columns
@@ -125,19 +144,25 @@ def bp_bytes(capture: Capture, grid: VolumeGrid) -> int:
 
 
 def fbp_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`fbp` allocates: the larger of the backprojection and the six volumes of its filter."""
+    """Bytes that :func:`fbp` allocates: those of the backprojection or of the six volumes of its filter.
+
+    Args:
+        capture: of any kind.
+        grid: where to reconstruct.
+
+    Returns:
+        Bytes, beyond the capture's counts: the larger of the two.
+    """
     return max(bp_bytes(capture, grid), _SCRATCH + 4 * 6 * grid.n_voxels)
 
 
 @dataclass(frozen=True)
 class _PathEnd:
-    """Distinct wall points at one end of the paths, which of them each spot uses, and how often the path runs
-    to them.
-    """
+    """Distinct wall points at one end of the paths."""
 
-    points: np.ndarray
-    of_spot: torch.Tensor
-    passes: float
+    points: np.ndarray  # [P, 3] m
+    of_spot: torch.Tensor  # [S] which of them each spot uses
+    passes: float  # how often the path runs to them
 
 
 def _path_ends(capture: Capture) -> list[_PathEnd]:
@@ -156,7 +181,7 @@ def _block_columns(grid: VolumeGrid, ends: list[_PathEnd]) -> int:
 
 
 def _squared_distances(points: np.ndarray, centres: np.ndarray, scale: float) -> torch.Tensor:
-    """``[P, V]`` squared distances between ``points [P, d]`` and ``centres [V, d]``, in units of ``1/scale``."""
+    """``[P, V]`` squared distances between ``points [P, d]`` and ``centres [V, d]``, in units ``1/scale``."""
     a, b = torch.from_numpy(points * scale).float(), torch.from_numpy(centres * scale).float()
     total = torch.zeros(len(a), len(b))
     for axis in range(a.shape[1]):
@@ -166,8 +191,9 @@ def _squared_distances(points: np.ndarray, centres: np.ndarray, scale: float) ->
 
 
 def _along(volume: torch.Tensor, axis: int, sigma: float, *, derivative: bool) -> torch.Tensor:
-    """The volume convolved along one axis with a Gaussian or its second derivative; edge values continue
-    outside.
+    """The volume convolved along one axis with a Gaussian or its second derivative.
+
+    Edge values continue outside.
     """
     radius = int(np.ceil(4 * sigma))
     t = np.arange(-radius, radius + 1)

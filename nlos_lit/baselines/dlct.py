@@ -1,5 +1,4 @@
-"""Directional light-cone transform: albedo and surface normal of every voxel by one three-dimensional
-deconvolution.
+"""Directional light-cone transform: albedo and normal of every voxel by one three-dimensional deconvolution.
 
 Young, Lindell, Girod, Taubman, Wetzstein, *Non-line-of-sight surface reconstruction using the directional
 light-cone transform*, CVPR 2020. A surface element of albedo ρ and normal n sends light along ω, from it to
@@ -40,20 +39,38 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 
 
 def dlct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float = 4.0) -> torch.Tensor:
-    """Albedo density ``|q|`` of :func:`dlct_field`, zero where the recovered surface faces away from the
-    wall.
+    """Albedo density ``|q|`` of :func:`dlct_field`, zero where the surface faces away from the wall.
 
-    Args, errors: of :func:`dlct_field`.
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct; zero outside the scanned rectangle and outside the depths of the gate.
+        snr: as of ``lct``.
+        falloff: as of :func:`dlct_field`.
 
     Returns:
         ``[nz, nx, ny]`` float32, nonnegative, in the units of ``lct``.
+
+    Raises:
+        UserError: ``snr`` is not positive.
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
     """
     return directed_volume(dlct_field(capture, grid, snr=snr, falloff=falloff))
 
 
 def directed_volume(field: torch.Tensor) -> torch.Tensor:
-    """``[nz, nx, ny]`` length of the vectors of ``field`` ``[3, nz, nx, ny]`` that point to the wall (z < 0),
-    zero elsewhere.
+    """Length of the vectors that point to the wall (z < 0), zero elsewhere.
+
+    Args:
+        field: ``[3, nz, nx, ny]`` vectors.
+
+    Returns:
+        ``[nz, nx, ny]``.
+
+    Examples:
+        >>> import torch
+        >>> field = torch.tensor([[3.0, 0.0], [0.0, 0.0], [-4.0, 1.0]]).view(3, 1, 1, 2)
+        >>> directed_volume(field).tolist()
+        [[[5.0, 0.0]]]
     """
     return field.norm(dim=0).mul_(field[2] < 0)
 
@@ -114,5 +131,16 @@ def _channels(cone: Cone, depth: float, snr: float) -> Iterator[torch.Tensor]:
 
 
 def dlct_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`dlct` allocates at its peak."""
+    """Bytes that :func:`dlct` allocates at its peak.
+
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct.
+
+    Returns:
+        Bytes, beyond the capture's counts.
+
+    Raises:
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
+    """
     return cone_bytes(capture, grid, "dlct", padded_arrays=7, volumes=5, matrices=2)

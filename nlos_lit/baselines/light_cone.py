@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from scipy.fft import next_fast_len
 
+from nlos_lit.baselines.inputs import confocal_lattice, gated_bins, gated_transients
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import ScanLattice
 from nlos_lit.capture.errors import UserError
@@ -52,18 +52,25 @@ def lct(capture: Capture, grid: VolumeGrid, *, snr: float = 0.8, falloff: float 
 
 
 class Cone(NamedTuple):
-    """Confocal transients over ``v``: ``values [M, nx, ny]``, cell ``k`` covering ``[first + k·step, first +
-    (k+1)·step)`` m².
-    """
+    """Confocal transients over ``v``; cell ``k`` covers ``[first + k·step, first + (k+1)·step)``."""
 
-    values: torch.Tensor
+    values: torch.Tensor  # [M, nx, ny] counts per m², times v^(p/2)
     lattice: ScanLattice
-    first: float
-    step: float
+    first: float  # m²
+    step: float  # m²
 
 
 def light_cone(capture: Capture, grid: VolumeGrid, method: str, falloff: float) -> Cone:
-    """``v^(p/2)`` times counts per unit of ``v``, with ``p`` = ``falloff``; ``method`` is named in messages.
+    """Transients resampled from path to ``v = (path/2)²``, as counts per unit of ``v`` times ``v^(p/2)``.
+
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct; bins that its light cannot reach are left out.
+        method: named in messages.
+        falloff: p, how counts fall with distance.
+
+    Returns:
+        As many cells of equal width in v as there are bins; counts are kept.
 
     Raises:
         CaptureError: not confocal, no lattice, or the volume lies outside the gate.
@@ -79,7 +86,15 @@ def light_cone(capture: Capture, grid: VolumeGrid, method: str, falloff: float) 
 
 
 def lateral_weights(lattice: ScanLattice, grid: VolumeGrid) -> tuple[torch.Tensor, torch.Tensor]:
-    """Matrices that resample from the scan's lattice to the grid, along x and along y."""
+    """Matrices that resample from the scan's lattice to the grid.
+
+    Args:
+        lattice: of the scan.
+        grid: where to reconstruct.
+
+    Returns:
+        Along x and along y, ``[grid's points, lattice's points]`` each.
+    """
     axes = zip(
         lattice.origin[:2], lattice.pitch, lattice.shape, (grid.x, grid.y), grid.pitch[:2], strict=True
     )
@@ -88,8 +103,9 @@ def lateral_weights(lattice: ScanLattice, grid: VolumeGrid) -> tuple[torch.Tenso
 
 
 def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr: float) -> torch.Tensor:
-    """Solves ``cone = k ⊛ x`` for ``x``: minimises ``‖k ⊛ x - cone‖² + ‖k‖²/snr·‖x‖²`` on a domain padded to
-    twice the size.
+    """Solve ``cone = k ⊛ x`` for ``x`` by a Wiener filter.
+
+    Minimises ``‖k ⊛ x - cone‖² + ‖k‖²/snr·‖x‖²`` on a domain padded to twice the size.
 
     Args:
         cone: ``[M, nx, ny]`` samples in ``v``, zero where padded.
@@ -114,15 +130,39 @@ def wiener_cone(cone: torch.Tensor, pitch: tuple[float, float], step: float, snr
 
 
 def lct_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`lct` allocates at its peak."""
+    """Bytes that :func:`lct` allocates at its peak.
+
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct.
+
+    Returns:
+        Bytes, beyond the capture's counts.
+
+    Raises:
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
+    """
     return cone_bytes(capture, grid, "lct", padded_arrays=4, volumes=1, matrices=1)
 
 
 def cone_bytes(
     capture: Capture, grid: VolumeGrid, method: str, *, padded_arrays: int, volumes: int, matrices: int
 ) -> int:
-    """Bytes of a light-cone method: three copies of the transients, and at once so many arrays of the
-    transform's size, volumes, and matrices from the cone to depths; ``method`` is named in messages.
+    """Bytes of a light-cone method: three copies of the transients and what it holds beside them.
+
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct.
+        method: named in messages.
+        padded_arrays: arrays of the transform's size that it holds at once.
+        volumes: arrays of the grid's size that it holds at once.
+        matrices: from the cone to depths that it holds at once.
+
+    Returns:
+        Bytes, beyond the capture's counts.
+
+    Raises:
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
     """
     bins = gated_bins(capture, grid)
     m, nx, ny = padded((bins, *confocal_lattice(capture, method).shape))
@@ -135,27 +175,36 @@ def cone_bytes(
     )
 
 
-def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
-    """How many bins of the gate :func:`lct` and f-k migration work on: those that light from the volume can
-    reach.
-    """
-    longest = path_range(capture, grid)[1]
-    return (
-        min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1)
-        - capture.gate[0]
-    )
-
-
 def padded(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """A size whose FFT is fast and at least twice as long along every axis, so that a convolution is linear."""
+    """A size whose FFT is fast and at least twice as long along every axis: convolutions are then linear.
+
+    Examples:
+        >>> padded((5, 7, 11))
+        (10, 15, 24)
+    """
     return tuple(next_fast_len(2 * n, real=True) for n in shape)
 
 
 def cone_kernel(
     shape: tuple[int, ...], size: tuple[int, ...], pitch: tuple[float, float], step: float
 ) -> torch.Tensor:
-    """``δ(x² + y² - w)`` on the lattice: at each lateral offset one lattice cell's area, shared by the two
-    nearest ``w``.
+    """The kernel ``δ(x² + y² - w)`` on the lattice, with its negative offsets at the far ends of its axes.
+
+    At each lateral offset lies one lattice cell's area, shared by the two nearest ``w``.
+
+    Args:
+        shape: ``(M, nx, ny)`` of what it is convolved with.
+        size: of the transform, from :func:`padded`.
+        pitch: of the lattice, m.
+        step: spacing of w, m².
+
+    Returns:
+        ``[*size]`` float32, m².
+
+    Examples:
+        >>> kernel = cone_kernel((3, 2, 2), (6, 4, 4), pitch=(1.0, 1.0), step=1.0)
+        >>> kernel[:3, 0, 0].tolist(), kernel[:3, 1, 1].tolist(), kernel[:3, -1, 0].tolist()
+        ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 1.0, 0.0])
     """
     bins, nx, ny = shape
     x, y = np.meshgrid(np.arange(1 - nx, nx), np.arange(1 - ny, ny), indexing="ij")
@@ -168,9 +217,33 @@ def cone_kernel(
     return torch.from_numpy(kernel)
 
 
+def cone_to_depth(cone: Cone, depth: np.ndarray, width: float, power: int = 1) -> torch.Tensor:
+    """Matrix that takes R over ``u = z²`` to ``2 z^power·R(z²)`` at depths.
+
+    It is linear in ``u`` between cell centres and averages over each voxel's depth. With ``power`` 1 this is
+    the density in z, ``ρ(z) = 2z·R(z²)``.
+
+    Args:
+        cone: gives the cells of u.
+        depth: ``[nz]`` distances of voxel centres from the wall, m.
+        width: depth of a voxel, m.
+        power: of z.
+
+    Returns:
+        ``[nz, M]``.
+    """
+    bins, first, step = len(cone.values), cone.first, cone.step
+    finest = np.sqrt(first + step * bins) - np.sqrt(first + step * (bins - 1))
+    parts = max(1, int(np.ceil(abs(width) / finest)))
+    z = depth[:, None] + ((np.arange(parts) + 0.5) / parts - 0.5) * abs(width)
+    weights = linear_weights(first + step / 2, step, bins, np.where(z > 0, z**2, -1.0).reshape(-1), 0.0)
+    return (weights.view(len(depth), parts, bins) * torch.from_numpy(2 * z**power).float()[..., None]).mean(1)
+
+
 def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tensor:
-    """Sparse ``[M, T]``: counts in bins with ``edges`` in ``v`` to ``v^(p/2)`` times counts per unit ``v`` in
-    equal cells.
+    """Sparse ``[M, T]`` from counts in bins to counts per unit of ``v`` times ``v^(p/2)`` in equal cells.
+
+    ``edges`` ``[T + 1]`` are the bins' in v.
     """
     bins = len(edges) - 1
     cells = edges[0] + step * np.arange(bins + 1)
@@ -183,17 +256,3 @@ def _path_to_cone(edges: np.ndarray, step: float, falloff: float) -> torch.Tenso
     return torch.sparse_coo_tensor(
         index, torch.from_numpy(value).float(), (bins, bins), check_invariants=True
     )
-
-
-def cone_to_depth(cone: Cone, depth: np.ndarray, width: float, power: int = 1) -> torch.Tensor:
-    """Matrix ``[nz, M]``: ``2 z^power·R(z²)``, linear in ``u`` between cell centres, averaged over each
-    voxel's depth.
-
-    With ``power`` 1 this is the density in z, ``ρ(z) = 2z·R(z²)``.
-    """
-    bins, first, step = len(cone.values), cone.first, cone.step
-    finest = np.sqrt(first + step * bins) - np.sqrt(first + step * (bins - 1))
-    parts = max(1, int(np.ceil(abs(width) / finest)))
-    z = depth[:, None] + ((np.arange(parts) + 0.5) / parts - 0.5) * abs(width)
-    weights = linear_weights(first + step / 2, step, bins, np.where(z > 0, z**2, -1.0).reshape(-1), 0.0)
-    return (weights.view(len(depth), parts, bins) * torch.from_numpy(2 * z**power).float()[..., None]).mean(1)

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from scipy.fft import next_fast_len
 
-from nlos_lit.baselines.light_cone import gated_bins
+from nlos_lit.baselines.inputs import confocal_lattice, gated_bins, gated_transients
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import confocal_lattice, gated_transients
 from nlos_lit.capture import Capture
 from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
@@ -24,7 +23,7 @@ _SCRATCH = 24 << 20  # bytes that the allocator and the libraries were seen to k
 
 
 def fk(capture: Capture, grid: VolumeGrid, *, falloff: float = 4.0) -> torch.Tensor:
-    """f-k migration of the square root of the counts; returns the squared magnitude of the migrated field.
+    """f-k migration of the square root of the counts: squared magnitude of the migrated field.
 
     Args:
         capture: confocal, on a regular planar lattice.
@@ -107,7 +106,18 @@ def stolt(field: torch.Tensor, pitch: tuple[float, float], step: float, first: f
 
 
 def fk_bytes(capture: Capture, grid: VolumeGrid) -> int:
-    """Bytes that :func:`fk` allocates at its peak."""
+    """Bytes that :func:`fk` allocates at its peak.
+
+    Args:
+        capture: confocal, on a regular planar lattice.
+        grid: where to reconstruct.
+
+    Returns:
+        Bytes, beyond the capture's counts.
+
+    Raises:
+        CaptureError: not confocal, no lattice, or the volume lies outside the gate.
+    """
     lattice = confocal_lattice(capture, "f-k")
     bins = gated_bins(capture, grid)
     size, px, py = (next_fast_len(2 * n, real=True) for n in (bins, *lattice.shape))

@@ -1,6 +1,4 @@
-"""Linear resampling of a volume from the lattice a method works on to the grid that was asked for, one axis
-at a time.
-"""
+"""Linear resampling of a volume from the lattice a method works on to the grid that was asked for."""
 
 from __future__ import annotations
 
@@ -9,12 +7,28 @@ import torch
 
 
 def linear_weights(start: float, pitch: float, count: int, centres: np.ndarray, width: float) -> torch.Tensor:
-    """Matrix ``[len(centres), count]`` that interpolates samples at ``start + k·pitch`` linearly and averages
-    over voxels.
+    """Matrix that interpolates evenly spaced samples linearly and averages over voxels, along one axis.
 
     A voxel narrower than the sample pitch takes the interpolated value at its centre; a wider one takes the
     mean over ``width``, so that no sample is skipped. Voxels whose centre lies more than half a pitch outside
     the samples get zero. Where the two lattices coincide the matrix is the identity.
+
+    Args:
+        start: place of sample 0.
+        pitch: spacing of the samples, positive; all in one unit.
+        count: M, number of samples.
+        centres: ``[N]`` centres of voxels.
+        width: of a voxel; its sign does not matter.
+
+    Returns:
+        ``[N, M]`` float32.
+
+    Examples:
+        >>> import numpy as np
+        >>> linear_weights(0.0, 1.0, 3, np.array([0.25, 2.0, 9.0]), 0.5)
+        tensor([[0.7500, 0.2500, 0.0000],
+                [0.0000, 0.0000, 1.0000],
+                [0.0000, 0.0000, 0.0000]])
     """
     parts = max(1, int(np.ceil(abs(width) / pitch - 1e-6)))
     offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * abs(width)
@@ -35,7 +49,17 @@ def linear_weights(start: float, pitch: float, count: int, centres: np.ndarray, 
 def apply_weights(
     volume: torch.Tensor, along_z: torch.Tensor, along_x: torch.Tensor, along_y: torch.Tensor
 ) -> torch.Tensor:
-    """``[mz, mx, my]`` volume to ``[nz, nx, ny]`` by one matrix ``[n, m]`` per axis; identities are skipped."""
+    """Resample a volume by one matrix per axis; identities along x and y are skipped.
+
+    Args:
+        volume: ``[mz, mx, my]``.
+        along_z: ``[nz, mz]``.
+        along_x: ``[nx, mx]``.
+        along_y: ``[ny, my]``.
+
+    Returns:
+        ``[nz, nx, ny]``, contiguous.
+    """
     volume = torch.tensordot(along_z, volume, dims=1)
     if not _identity(along_x):
         volume = torch.einsum("ix,zxy->ziy", along_x, volume)

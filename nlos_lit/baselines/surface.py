@@ -8,9 +8,8 @@ from scipy.ndimage import gaussian_filter
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.io.points import Points
 
-STEEPEST = (
-    4.0  # change of depth from one column to the next, in columns, above which they are not one surface
-)
+# Change of depth from one column to the next, in columns, above which they are not one surface.
+STEEPEST = 4.0
 
 
 def front_points(
@@ -23,15 +22,26 @@ def front_points(
     """One point a column whose maximum reaches ``threshold`` of the volume's.
 
     Args:
-        volume: ``[nz, nx, ny]``.
+        volume: ``[nz, nx, ny]``, nonnegative.
+        grid: where its voxels lie.
         threshold: share of the volume's maximum.
         field: ``[3, nz, nx, ny]`` vectors along the surface's normal, where the method gives them; None takes
             normals from the depths of neighbouring columns …
         smooth: … after a Gaussian of this many columns.
 
     Returns:
-        Points with the volume's value, relative to its maximum, as albedo and intensity. The depth is the
-        vertex of the parabola through the largest value and its two neighbours.
+        Points with the volume's value, relative to its maximum, as albedo and intensity; none where the
+        volume is empty. The depth is the vertex of the parabola through the largest value and its two
+        neighbours.
+
+    Examples:
+        >>> import numpy as np
+        >>> volume = np.zeros((5, 1, 2))
+        >>> volume[1:4, 0, 0] = [1.0, 2.0, 1.0]
+        >>> grid = VolumeGrid((0.0, 0.0, 0.5), (0.1, 0.1, 0.1), (5, 1, 2))
+        >>> points = front_points(volume, grid, threshold=0.5)
+        >>> points.positions.round(6).tolist(), points.normals.tolist()
+        ([[0.0, 0.0, 0.7]], [[0.0, 0.0, -1.0]])
     """
     peak = float(volume.max())
     if not peak > 0:
@@ -53,9 +63,7 @@ def front_points(
 
 
 def _vertex(volume: np.ndarray, best: np.ndarray) -> np.ndarray:
-    """Where between -½ and ½ planes the parabola through a maximum and its neighbours is largest; 0 at the
-    ends.
-    """
+    """Where in ±½ planes the parabola through a maximum and its neighbours is largest; 0 at the ends."""
     last = len(volume) - 1
     if last < 2:
         return np.zeros(best.shape)
@@ -71,8 +79,9 @@ def _vertex(volume: np.ndarray, best: np.ndarray) -> np.ndarray:
 def _normals_of_depth(
     depth: np.ndarray, seen: np.ndarray, pitch: tuple[float, float, float], smooth: float
 ) -> np.ndarray:
-    """``[3, nx, ny]`` (∂z/∂x, ∂z/∂y, -1) of the smoothed depths of seen columns; towards the wall where a
-    column stands alone.
+    """``[3, nx, ny]`` (∂z/∂x, ∂z/∂y, -1) of the smoothed depths of seen columns.
+
+    It points straight to the wall where a column stands alone.
     """
     weight = gaussian_filter(seen.astype(np.float64), smooth) if smooth else seen.astype(np.float64)
     blurred = gaussian_filter(np.where(seen, depth, 0), smooth) if smooth else np.where(seen, depth, 0)
@@ -82,9 +91,7 @@ def _normals_of_depth(
 
 
 def _slope(surface: np.ndarray, axis: int, pitch: float) -> np.ndarray:
-    """Mean of the differences to the neighbours on either side that belong to the same surface; 0 where there
-    is none.
-    """
+    """Mean slope to the neighbours on either side that belong to the same surface; 0 where there is none."""
     step = np.diff(surface, axis=axis) / pitch
     step = np.where(np.abs(step) < STEEPEST, step, np.nan)
     edge = np.full_like(np.take(surface, [0], axis), np.nan)

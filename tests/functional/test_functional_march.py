@@ -53,7 +53,7 @@ def marched(volume, grid, origins, frames, rays, threshold, step, reach, chunk=1
 
 
 def scene(seed: int):
-    """A random sparse volume and wall points: near it, inside it, far aside, with normals tilted up to 70°."""
+    """A random sparse volume and wall points: near it, inside it, far aside, normals tilted up to 70°."""
     generator = torch.manual_seed(seed)
 
     def uniform(low, high):
@@ -204,8 +204,8 @@ def test_trilinear_by_hand():
     )
     middle = torch.tensor([[1.25, -2.0, 0.5], [1.0, -2.125, 0.5], [1.0, -2.0, 0.55], [1.25, -2.375, 0.65]])
     expected = torch.stack([
-        (volume[0, 0, 0] + volume[0, 1, 0]) / 2, (volume[0, 0, 0] + volume[0, 0, 1]) / 2, (volume[0, 0, 0] + volume[1, 0, 0]) / 2,
-        volume[1:3, :, 1:3].mean(),
+        (volume[0, 0, 0] + volume[0, 1, 0]) / 2, (volume[0, 0, 0] + volume[0, 0, 1]) / 2,
+        (volume[0, 0, 0] + volume[1, 0, 0]) / 2, volume[1:3, :, 1:3].mean(),
     ])  # fmt: skip
     assert torch.allclose(trilinear(volume, middle, grid), expected, rtol=1e-4)
     outside = torch.tensor([[0.2, -1.0, 0.1], [9.0, -9.0, 9.0]])

@@ -190,5 +190,8 @@ def test_json_refuses_what_it_cannot_say(tmp_path):
 
 
 def test_export_needs_no_open3d():
-    code = "import sys, nlos_lit.io.files, nlos_lit.io.meshes, nlos_lit.report.figures, nlos_lit.training.summary; sys.exit('open3d' in sys.modules)"
+    code = (
+        "import sys, nlos_lit.io.files, nlos_lit.io.meshes, nlos_lit.report.figures, "
+        "nlos_lit.training.summary; sys.exit('open3d' in sys.modules)"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -44,7 +44,10 @@ def test_memory_budget(monkeypatch):
     )
     assert streamed.total_bytes < half.total_bytes
     assert "GiB float32 on disk +" in str(streamed)
-    sentence = r"\(400000, 4, 3\) voxels × \d+ needs .* GiB of memory and .* GiB of temporary disk .* the budget is .* GiB"
+    sentence = (
+        r"\(400000, 4, 3\) voxels × \d+ needs .* GiB of memory and .* GiB of temporary disk .* "
+        r"the budget is .* GiB"
+    )
     with pytest.raises(MemoryBudgetError, match=sentence):
         phasor.plan(capture, streamed.total_bytes - 1)
     monkeypatch.setattr("nlos_lit.model.phasor._free_disk", lambda: full.field_bytes - 1)

@@ -29,7 +29,8 @@ def fields(**changes) -> dict:
     counts = np.arange(120, dtype=np.uint16).reshape(12, 10)
     given = {
         "counts": counts, "laser": points, "sensor": points, "laser_normal": np.tile(NORMAL, (12, 1)),
-        "sensor_normal": np.tile(NORMAL * 2, (12, 1)), "bin_length": 0.1, "t_start": 0.5, "scan_shape": (4, 3),
+        "sensor_normal": np.tile(NORMAL * 2, (12, 1)), "bin_length": 0.1, "t_start": 0.5,
+        "scan_shape": (4, 3),
     }  # fmt: skip
     return given | changes
 

@@ -10,8 +10,8 @@ import torch
 from baseline_scenes import box, capture_of, lattice
 
 from nlos_lit.baselines import METHODS, estimate_bytes, reconstruct
+from nlos_lit.baselines.inputs import gated_transients
 from nlos_lit.baselines.resample import apply_weights, linear_weights
-from nlos_lit.baselines.scan import gated_transients
 from nlos_lit.capture.aperture import find_lattice
 from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError
 from nlos_lit.capture.volume_grid import path_range

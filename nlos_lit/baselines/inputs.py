@@ -1,6 +1,4 @@
-"""What the classical methods need to know of a scan: its lattice, the paths that reach a volume, the gated
-bins.
-"""
+"""What the classical methods take from a capture: its lattice, and the gated bins that a volume can reach."""
 
 from __future__ import annotations
 
@@ -10,11 +8,18 @@ import torch
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import ScanLattice, find_lattice
 from nlos_lit.capture.errors import CaptureError
+from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 
 
 def confocal_lattice(capture: Capture, method: str) -> ScanLattice:
-    """The scan lattice of a confocal capture, for a ``method`` (its name, for the message) that works on
-    nothing else.
+    """The scan lattice of a confocal capture, for a method that works on nothing else.
+
+    Args:
+        capture: what was measured.
+        method: its name, for the message.
+
+    Returns:
+        The lattice.
 
     Raises:
         CaptureError: the capture is not confocal, or its spots are not a regular planar grid.
@@ -30,7 +35,12 @@ def confocal_lattice(capture: Capture, method: str) -> ScanLattice:
 
 
 def gated_transients(capture: Capture, longest: float, falloff: float) -> tuple[torch.Tensor, float]:
-    """The bins inside the gate, up to path ``longest`` (m), times ``(path/2)^falloff``.
+    """The bins inside the gate, up to a longest path, times ``(path/2)^falloff``.
+
+    Args:
+        capture: what was measured.
+        longest: path after which bins are left out, m.
+        falloff: power of half the path (m) at a bin's centre; 0 leaves the counts as they are.
 
     Returns:
         ``[S, T']`` float32 and the path at the start of its first bin, m. Bins that begin at a negative path
@@ -45,3 +55,23 @@ def gated_transients(capture: Capture, longest: float, falloff: float) -> tuple[
         depth = (start + (torch.arange(last - first, dtype=torch.float64) + 0.5) * step) / 2
         counts *= depth.pow(falloff).float()
     return counts, start
+
+
+def gated_bins(capture: Capture, grid: VolumeGrid) -> int:
+    """How many bins of the gate light from a volume can reach: those that lct, dlct and fk work on.
+
+    Args:
+        capture: what was measured.
+        grid: where to reconstruct.
+
+    Returns:
+        Bins from the gate's first to one after the longest path's.
+
+    Raises:
+        CaptureError: the volume lies outside the gate.
+    """
+    longest = path_range(capture, grid)[1]
+    return (
+        min(capture.gate[1], int(np.ceil((longest - capture.t_start) / capture.bin_length)) + 1)
+        - capture.gate[0]
+    )
