@@ -1,0 +1,1 @@
+"""Captures for the fit: readers of public file formats, ground truth by simulation, batches of spots."""

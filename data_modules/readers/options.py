@@ -66,13 +66,23 @@ class ReaderOptions:
 
     @property
     def given(self) -> dict[str, object]:
-        """Only what was said, by name."""
+        """Only what was said, by name.
+
+        Examples:
+            >>> ReaderOptions(bin_width_ps=4.0, gate=(600, 2048)).given
+            {'bin_width_ps': 4.0, 'gate': (600, 2048)}
+        """
         pairs = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {name: value for name, value in pairs if value is not None}
 
     @property
     def wall_sides(self) -> tuple[float, float] | None:
-        """``wall_size`` as (x, y), m."""
+        """``wall_size`` as (x, y), m.
+
+        Examples:
+            >>> ReaderOptions(wall_size=0.7).wall_sides, ReaderOptions(wall_size=(2.0, 1.0)).wall_sides
+            ((0.7, 0.7), (2.0, 1.0))
+        """
         if self.wall_size is None:
             return None
         x, y = self.wall_size if isinstance(self.wall_size, Sequence) else (self.wall_size, self.wall_size)
