@@ -1,9 +1,9 @@
-"""What every effect must keep to; an effect's test inherits :class:`EffectContract`."""
+"""What every effect must keep to: :class:`EffectContract` runs over the registry."""
 
 from __future__ import annotations
 
+import re
 from functools import lru_cache
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -11,16 +11,20 @@ import torch
 from torch import Tensor, nn
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import STAGES, Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.hooks import Hooks
+from nlos_lit.effects.hooks import HOOKS
+from nlos_lit.effects.nominal import numbers_of
+from nlos_lit.effects.page import sections
+from nlos_lit.effects.strengths import effects_at
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 BIN, T_START, GATE, SPOTS = 0.02, 0.62, (6, 64), 10
-HOOKS = {
+HOOKS_OF_STAGE = {
     "path": {"path", "transients"},
     "time": {"time", "path"},
     "response": {"response"},
@@ -94,52 +98,42 @@ def probe(shape: torch.Size, seed: int = 1) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
+def away(effect: Effect) -> Effect:
+    """Every parameter well away from its null, at the typical strength if there is one; shapes off grids."""
+    effect.draw(effect.typical(effect.scan), np.random.default_rng(3))
+    for p in effect.shapes:
+        effect.set(p.name, 1.013 * p.grid[len(p.grid) // 2])
+    for p in effect.amplitudes:
+        if bool((effect.value(p.name) == p.null).all()):
+            effect.set(p.name, p.null + p.scale * (1 if p.upper > p.null else -1))
+    return effect
+
+
 @pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 class EffectContract:
-    """``class TestMine(EffectContract, effect=Mine, strength=0.2, decay=0.1)``: every parameter well away
-    from its null.
-
-    Coefficients get from a fifth of the value to all of it.
-    """
-
-    effect: ClassVar[type[Effect]]
-    values: ClassVar[dict[str, float]]
-
-    def __init_subclass__(cls, *, effect: type[Effect], **values: float) -> None:
-        super().__init_subclass__()
-        cls.effect, cls.values = effect, values
+    """A subclass has a fixture ``built``: the effect's class, which is in the registry."""
 
     @pytest.fixture(params=["confocal", "exhaustive"])
     def model(self, request: pytest.FixtureRequest) -> SurfelModel:
         return scene(request.param)[0]
 
     @pytest.fixture
-    def at_null(self, model: SurfelModel) -> Effect:
-        return self.effect(
-            next(scan for built, scan in map(scene, ("confocal", "exhaustive")) if built is model)
-        )
+    def at_null(self, built: type[Effect], model: SurfelModel) -> Effect:
+        return built(next(scan for one, scan in map(scene, ("confocal", "exhaustive")) if one is model))
 
     @pytest.fixture
     def fresh(self, at_null: Effect) -> Effect:
-        """The effect at the test's values."""
-        for name, value in self.values.items():
-            size = at_null.declared[name].size
-            at_null.set(name, value if size == 1 else value * torch.linspace(0.2, 1, size))
-        return at_null
+        """The effect away from its null."""
+        return away(at_null)
 
     spots = torch.arange(SPOTS)
 
     def test_declaration(self, at_null: Effect) -> None:
         assert at_null.stage in STAGES
         assert at_null.needs_paths == (at_null.stage in ("path", "time"))
-        overridden = {
-            n
-            for n in vars(Hooks)
-            if not n.startswith("_") and getattr(type(at_null), n) is not getattr(Hooks, n)
-        }
-        assert overridden
-        assert overridden <= HOOKS[at_null.stage]
-        assert {p.name for p in at_null.declared.values()} == set(self.values), "give every parameter a value"
+        assert at_null.hooks
+        assert at_null.hooks <= HOOKS
+        assert at_null.hooks <= HOOKS_OF_STAGE[at_null.stage]
         assert at_null.amplitudes
         for p in at_null.declared.values():
             assert p.lower < p.upper
@@ -148,8 +142,61 @@ class EffectContract:
             assert p.lower <= (p.grid[0] if p.null is None else p.null) <= p.upper
         if at_null.per_spot:
             assert [p.size for p in at_null.declared.values()] == [SPOTS]
-        for section in ("Parameters:", "Signature:", "Degenerate with:", "Source:"):
-            assert section in (type(at_null).__doc__ or ""), section
+        if at_null.witness == "energy":
+            assert "gain" in at_null.hooks
+        if at_null.witness == "tail":
+            assert at_null.declared["decay"].unit == "m"
+
+    def test_docstring(self, built: type[Effect]) -> None:
+        told = sections(built)
+        assert set(told) == {"what", "equation", "Parameters", "Signature", "Degenerate with", "Source"}
+        assert all(told.values())
+        assert "`" in told["equation"]
+        for name in numbers_of(built):
+            assert f"`{name}`" in told["Parameters"], name
+
+    def test_words(self, built: type[Effect]) -> None:
+        assert built.words is not None
+        assert built.words.phrase[0].islower()
+        for sentence in (built.words.cause, built.words.remedy):
+            assert sentence.endswith(".")
+        fields = set(re.findall(r"{(\w+)}", built.words.headline))
+        assert fields
+        assert fields <= set(numbers_of(built))
+
+    def test_what_would_tell_it_apart_is_said_once_of_each_pair(self, built: type[Effect]) -> None:
+        for other, measurement in built.split_by.items():
+            there = EFFECTS.named(other)
+            assert there is not None, f"{other} is not in the registry"
+            assert built.name not in there.split_by
+            assert EFFECTS.splitting(built.name, other) == EFFECTS.splitting(other, built.name) == measurement
+
+    def test_typical_strength(self, at_null: Effect) -> None:
+        """It can be given, as each of its numbers alone can, and says what was given."""
+        typical, settable = at_null.typical(at_null.scan), at_null.settable()
+        assert typical
+        assert set(typical) <= set(settable)
+        shapes = {p.name for p in at_null.shapes}
+        assert set(typical).isdisjoint(shapes), "shapes are at the middle of their grids"
+        null = {name: value.clone() for name, value in at_null.state_dict().items()}
+        at_null.draw(typical, np.random.default_rng(0))
+        assert any(not torch.equal(value, null[name]) for name, value in at_null.state_dict().items())
+        numbers = at_null.quantities()
+        for name in set(settable) & set(numbers):
+            assert numbers[name].unit == settable[name], name
+        (again,) = effects_at([at_null.name], {}, at_null.scan, seed=1)
+        (same,) = effects_at([at_null.name], {}, at_null.scan, seed=1)
+        for name, value in again.state_dict().items():
+            assert torch.equal(value, same.state_dict()[name])
+
+    def test_too_strong_is_refused(self, at_null: Effect) -> None:
+        for name in at_null.typical(at_null.scan):
+            with pytest.raises(UserError, match=rf"{at_null.name}\.{name} must"):
+                effects_at([at_null.name], {f"{at_null.name}.{name}": 1e9}, at_null.scan)
+
+    def test_numbers_do_not_hang_on_the_scan(self, built: type[Effect], at_null: Effect) -> None:
+        with torch.no_grad():
+            assert at_null.numbers() == numbers_of(built)
 
     def test_null_is_identity(self, model: SurfelModel, at_null: Effect) -> None:
         plain, changed = model.expected(self.spots), model.expected(self.spots, Extension([at_null]))
@@ -160,9 +207,9 @@ class EffectContract:
         assert float((changed - plain).abs().max()) > 1e-3 * float(plain.max())
 
     @pytest.mark.parametrize("where", ["null", "values"])
-    def test_gradients(self, model: SurfelModel, request: pytest.FixtureRequest, where: str) -> None:
-        """Backward against central differences and forward mode, for every parameter and the surfels' depths."""
-        effect = request.getfixturevalue("at_null" if where == "null" else "fresh")
+    def test_gradients(self, model: SurfelModel, at_null: Effect, where: str) -> None:
+        """Backward against central differences and forward mode, for every parameter and surfels' depths."""
+        effect = at_null if where == "null" else away(at_null)
         rendered = _double(model, effect)
         weights = probe(rendered(self.spots).shape)
         names = [
@@ -276,4 +323,6 @@ def _double(model: SurfelModel, effect: Effect) -> Rendered:
 
 
 def registered(name: str) -> type[Effect]:
-    return next(effect for effect in EFFECTS if effect.name == name)
+    effect = EFFECTS.named(name)
+    assert effect is not None
+    return effect

@@ -23,9 +23,10 @@ class HigherOrderBounces(Effect):
     """The fourth bounce laser → wall → surfel a → surfel b → wall → sensor is added to the third.
 
     ``H_r → H_r + strength Σ_ab ρ_a ρ_b/π · F_l(a) A_a · cosθ_ab cosθ_ba/(d_ab² + A/π) · A_b F_s(b)`` at
-    ``d_la + d_ab + d_bs``, with ``F = cosθ_wall cosθ_surfel/d²`` of the leg from the wall; the common
-    reflectances and 1/π of the wall are left out, as in the third bounce. A, the mean area of the two, keeps
-    the throughput of touching surfels finite. No surfel hides another one.
+    ``d_la + d_ab + d_bs``, with ``F = cosθ_wall cosθ_surfel/d²`` of the leg from the wall.
+
+    The common reflectances and 1/π of the wall are left out, as in the third bounce. A, the mean area of the
+    two, keeps the throughput of touching surfels finite. No surfel hides another one.
 
     Estimator: surfels join in at most 48 clusters, cells of a cube lattice. Powers into and out of the
     clusters are exact sums over their surfels: what leaves surfel a towards b is the third bounce's energy

@@ -81,7 +81,7 @@ def test_maps_hold_every_smooth_function_of_the_wall_but_the_constant(name, piec
 
 
 def test_reflectance_is_one_map_of_both_wall_points():
-    """A spot with laser at a, sensor at b has the gain of the spot with laser at b, sensor at a: f(a) + f(b)."""
+    """A spot with laser at a, sensor at b has the gain of that with laser at b, sensor at a: f(a) + f(b)."""
     generator = torch.Generator().manual_seed(0)
     a, b = torch.rand(2, 40, 2, generator=generator) * 2 - 1
     points = [torch.cat([p / 2, torch.zeros(40, 1)], 1) for p in (a, b)]

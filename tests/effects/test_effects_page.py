@@ -1,51 +1,35 @@
-"""The documentation's table and its example of a new effect."""
+"""The generated parts of the documentation say what the classes say."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from types import ModuleType
 
-import pytest
-import torch
-from effect_contract import BIN, EffectContract, scene
+from effect_contract import scene
 
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.page import generated
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
-
-
-(CODE,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-WRITTEN = ModuleType("laser_afterglow")
-exec(compile(CODE, "docs/effects.md", "exec"), WRITTEN.__dict__)
-LaserAfterglow = WRITTEN.LaserAfterglow
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
 
 
-class TestTheExample(EffectContract, effect=LaserAfterglow, fraction=0.2, duration=0.31):
-    pass
+def test_the_page_is_what_the_classes_say():
+    assert generated(PAGE) == PAGE, "run python -m nlos_lit.effects.page"
+    assert len(re.findall("<!-- generated: ", PAGE)) == 4
 
 
-def test_the_example_does_what_it_says():
-    glow = LaserAfterglow(scene("confocal")[1])
-    glow.set("fraction", 0.3)
-    glow.set("duration", 4.5 * BIN)
-    kernel = torch.zeros(10)
-    kernel[3] = 1.0
-    by_hand = torch.zeros(3 + 64)
-    by_hand[3:7] = 0.3 / 4.5
-    by_hand[7] = 0.3 * 0.5 / 4.5
-    by_hand[3] += 1
-    assert glow.response(kernel, 3).detach() == pytest.approx(by_hand, abs=1e-5)
-
-
-def test_the_example_is_not_in_the_registry():
-    assert "laser_afterglow" not in {effect.name for effect in EFFECTS}
+def test_numbers_of_effects_that_pages_name_are_those_there_are():
+    for file in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for number in re.findall(r"\b(\d+) effects\b", file.read_text(encoding="utf-8")):
+            assert int(number) == len(EFFECTS), file
 
 
 def test_the_table_lists_the_registry():
+    table = PAGE[PAGE.index("<!-- generated: table -->") :]
     rows = [
         [c.strip() for c in re.split(r"(?<!\\)\|", line)[1:-1]]
-        for line in PAGE.splitlines()
+        for line in table[: table.index("<!-- end -->")].splitlines()
         if line.startswith("| `")
     ]
     assert [row[0].strip("`") for row in rows] == [effect.name for effect in EFFECTS]

@@ -95,7 +95,7 @@ def test_energy_and_arrival_are_those_of_all_pairs(confocal, per_side):
 
 
 def test_two_surfels_by_hand():
-    """Surfels at (±0.4, 0, 0.8), turned by 45° towards each other: both cosines between them are √½, d = 0.8."""
+    """Surfels at (±0.4, 0, 0.8), turned by 45° towards each other: both cosines there are √½, d = 0.8."""
     model = valley(True)[1]
     wall, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
     capture = Capture(

@@ -109,9 +109,14 @@ def test_every_effect_has_a_strength_that_does_something(scan):
 
 def test_given_sizes_are_kept(scan):
     sizes = {
-        "time_drift.rms": 0.012, "timing_jitter.sigma": 0.004, "wall_reflectance.rms": 0.15, "ambient_map.rms": 0.4,
-        "hot_spots.level": 3.0, "hot_spots.number": 7, "irf_tail.decay": 0.3,
-    }  # fmt: skip
+        "time_drift.rms": 0.012,
+        "timing_jitter.sigma": 0.004,
+        "wall_reflectance.rms": 0.15,
+        "ambient_map.rms": 0.4,
+        "hot_spots.level": 3.0,
+        "hot_spots.number": 7,
+        "irf_tail.decay": 0.3,
+    }
     effects = effects_at({key.partition(".")[0] for key in sizes}, sizes, scan, seed=5, exposure=2.0)
     told = report(effects)
     assert told["time_drift"]["rms"] == {"value": pytest.approx(0.012, rel=1e-2), "unit": "m"}

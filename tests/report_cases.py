@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 
 import numpy as np
 
@@ -19,11 +18,11 @@ from nlos_lit.inference.result import (
     Unexplained,
 )
 
-NAMES = re.findall(
-    r"\w+",
-    "retroreflection specular_lobe occlusion higher_order_bounces time_offset time_drift timing_jitter clock_scale wall_tilt "
-    "laser_sensor_baseline irf_tail ghost_pulse power_drift wall_reflectance vignetting ambient_map hot_spots background_slope "
-    "direct_leak pile_up afterpulsing tcspc_nonlinearity gate_edges",
+NAMES = (
+    *("retroreflection", "specular_lobe", "occlusion", "higher_order_bounces", "time_offset", "time_drift"),
+    *("timing_jitter", "clock_scale", "wall_tilt", "laser_sensor_baseline", "irf_tail", "ghost_pulse"),
+    *("power_drift", "wall_reflectance", "vignetting", "ambient_map", "hot_spots", "background_slope"),
+    *("direct_leak", "pile_up", "afterpulsing", "tcspc_nonlinearity", "gate_edges"),
 )
 NAN = float("nan")
 TAIL = Accepted(
