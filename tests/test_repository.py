@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import ast
+import importlib
+import inspect
 import os
 import re
 import subprocess
 import sys
 import tomllib
+import types
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,8 +35,9 @@ MAY_IMPORT = {
     "surfels": CORE_ROOMS | {"io", "metrics", "runtime", "data_modules"},
     "inference": CORE_ROOMS | {"surfels", "metrics", "io", "runtime"},
     "report": LOW | {"effects", "inference", "io"},
-    "training": CORE_ROOMS | {"surfels", "report", "metrics", "io", "runtime", "data_modules"},
-    "paper": CORE_ROOMS | {"surfels", "report", "training", "baselines", "metrics", "io", "runtime", "data_modules"},
+    "training": CORE_ROOMS | {"surfels", "inference", "report", "metrics", "io", "runtime", "data_modules"},
+    "paper": CORE_ROOMS
+    | {"surfels", "report", "training", "baselines", "metrics", "io", "runtime", "data_modules"},
     "data_modules": LOW,
 }
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
@@ -51,7 +56,9 @@ def _tracked() -> list[str]:
 TRACKED = _tracked()
 MODULES = [name for name in TRACKED if name.endswith(".py")]
 PRODUCT = [name for name in MODULES if not name.startswith("tests/")]
-CORE = [name for name in PRODUCT if {"functional", "model", "effects", "baselines"} & set(Path(name).parts[:-1])]
+CORE = [
+    name for name in PRODUCT if {"functional", "model", "effects", "baselines"} & set(Path(name).parts[:-1])
+]
 
 
 def syntax(name: str) -> ast.Module:
@@ -70,7 +77,7 @@ def imported(tree: ast.AST) -> set[str]:
 
 
 def room_of(module: str) -> str:
-    """``nlos_lit.capture.scan`` → ``capture``; ``data_modules.readers`` → ``data_modules``; ``train`` → ``train``."""
+    """``nlos_lit.capture.scan`` → ``capture``; ``data_modules.load`` → ``data_modules``; ``train`` → ``train``."""
     parts = module.split(".")
     return parts[1] if parts[0] == "nlos_lit" and len(parts) > 1 else parts[0]
 
@@ -96,7 +103,7 @@ def test_imports_go_one_way(name):
 
 
 def test_doors_open_commands_alone():
-    """The commands at the top hold no logic: they import what the package has of them, and nothing below it."""
+    """They hold no logic: they import what the package has of their commands, and nothing below it."""
     for door in DOORS:
         assert imported_rooms(f"{door}.py") <= {"commands", "runtime"}, door
 
@@ -281,3 +288,48 @@ def test_ci_runs_the_tests_the_readme_names():
     ).stdout
     assert "scripts/setup.sh" in dry
     assert dry.index("scripts/setup.sh") < dry.index("nowhere/bin/python -m pytest")
+
+
+def undocumented(module: types.ModuleType) -> list[str]:
+    """Public functions of two or more arguments whose docstring lacks what one looks up: arguments, result.
+
+    What a method overrides is described where it first stands.
+    """
+    found = []
+    for name, member in vars(module).items():
+        if name.startswith("_") or getattr(member, "__module__", None) != module.__name__:
+            continue
+        if inspect.isclass(member):
+            inherited = {attribute for base in member.__mro__[1:] for attribute in vars(base)}
+            own = {f"{name}.{n}": f for n, f in vars(member).items() if n not in inherited and n[0] != "_"}
+        else:
+            own = {name: member}
+        for title, function in own.items():
+            function = inspect.unwrap(getattr(function, "__func__", function))
+            if inspect.isfunction(function) and not described(function):
+                found.append(title)
+    return found
+
+
+def described(function: Callable[..., object]) -> bool:
+    signature = inspect.signature(function)
+    arguments = set(signature.parameters) - {"self", "cls"}
+    text = function.__doc__ or ""
+    silent = signature.return_annotation in (None, "None")
+    return len(arguments) < 2 or ("Args:" in text and (silent or bool(re.search("Returns:|Yields:", text))))
+
+
+@pytest.mark.parametrize("name", [n for n in PRODUCT if n.startswith(("nlos_lit/", "data_modules/"))])
+def test_functions_say_what_they_take_and_give(name):
+    assert undocumented(importlib.import_module(dotted(name))) == []
+
+
+def test_undocumented_functions_are_found():
+    module = types.ModuleType("example")
+    module.f = lambda a, b: None
+    module.f.__module__ = "example"
+    assert undocumented(module) == ["f"]
+    module.f.__doc__ = "Args:\n    a, b: numbers"
+    assert undocumented(module) == ["f"]
+    module.f.__doc__ += "\nReturns:\n    nothing"
+    assert undocumented(module) == []
