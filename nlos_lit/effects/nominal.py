@@ -36,7 +36,9 @@ def nominal_scan() -> Scan:
     )
 
 
-@lru_cache
+_KNOWN: dict[type[Effect], Mapping[str, Number]] = {}
+
+
 @torch.no_grad()
 def numbers_of(effect: type[Effect]) -> Mapping[str, Number]:
     """Every number that may be said of an effect, by name, parameters first.
@@ -46,4 +48,6 @@ def numbers_of(effect: type[Effect]) -> Mapping[str, Number]:
         >>> numbers_of(EFFECTS.named("pile_up"))
         {'detections': Number(unit='1', kind='', null=0.0, share=True)}
     """
-    return effect(nominal_scan()).numbers()
+    if effect not in _KNOWN:
+        _KNOWN[effect] = effect(nominal_scan()).numbers()
+    return _KNOWN[effect]

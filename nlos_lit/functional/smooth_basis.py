@@ -1,6 +1,4 @@
-"""Smooth functions of one or two coordinates in [-1, 1]: combinations of uniform cubic B-splines, ordered by
-their roughness.
-"""
+"""Smooth functions of one or two coordinates: combinations of cubic B-splines, the smoothest first."""
 
 from __future__ import annotations
 
@@ -13,8 +11,21 @@ UNEVEN = 1.1
 
 
 def spline_basis(u: Tensor, n: int) -> Tensor:
-    """``[S, n]`` values of n ≥ 4 uniform cubic B-splines at ``u`` ``[S]`` in [-1, 1]; they sum to one
-    everywhere.
+    """Uniform cubic B-splines over [-1, 1]; they sum to one everywhere.
+
+    Args:
+        u: ``[S]`` places in [-1, 1].
+        n: number of splines, at least 4.
+
+    Returns:
+        ``[S, n]`` values.
+
+    Source: C. de Boor, *A Practical Guide to Splines*, 1978.
+
+    Examples:
+        >>> spline_basis(torch.tensor([-1.0, 1.0]), 4).round(decimals=4)
+        tensor([[0.1667, 0.6667, 0.1667, 0.0000],
+                [0.0000, 0.1667, 0.6667, 0.1667]])
     """
     pieces = n - 3
     place = ((u + 1) / 2 * pieces).clamp(0, pieces - 1e-5)
@@ -27,18 +38,39 @@ def spline_basis(u: Tensor, n: int) -> Tensor:
 
 
 def smooth_basis(u: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """Smooth functions of ``u`` ``[S]`` in [-1, 1], the smoothest first: ``[S, K ≤ n - 1]``, and their shares
-    ``[K]``.
+    """Smooth functions of one coordinate.
 
     Over the S points they average to zero with mean square 1; over the interval their slopes are orthogonal.
-    The share of a function is (first's mean squared slope)/(its own), the inverse square of its frequency.
+
+    Args:
+        u: ``[S]`` places in [-1, 1].
+        n: number of splines that they combine, at least 4.
+
+    Returns:
+        ``[S, K ≤ n - 1]`` functions, the smoothest first, and their shares ``[K]``: (first's mean squared
+        slope)/(its own), the inverse square of its frequency.
+
+    Examples:
+        >>> functions, share = smooth_basis(torch.linspace(-1, 1, 50), 6)
+        >>> functions.shape, [round(s, 2) for s in share.tolist()[:3]]
+        (torch.Size([50, 5]), [1.0, 0.25, 0.11])
+        >>> torch.allclose(functions.T @ functions / 50, torch.eye(5), atol=1e-4)
+        True
     """
     mass, stiffness = _line_products(n)
     return _by_smoothness(spline_basis(u.double(), n), stiffness, mass, u.dtype)
 
 
 def smooth_map_basis(place: Tensor, n: int) -> tuple[Tensor, Tensor]:
-    """The same over the wall, from ``place`` ``[S, 2]``: ``[S, K ≤ n² - 1]`` and ``[K]``."""
+    """Smooth functions of a place on the wall, as :func:`smooth_basis` has them along a line.
+
+    Args:
+        place: ``[S, 2]`` in [-1, 1]².
+        n: number of splines along either side, at least 4.
+
+    Returns:
+        ``[S, K ≤ n² - 1]`` functions, the smoothest first, and their shares ``[K]``.
+    """
     x, y = spline_basis(place[:, 0].double(), n), spline_basis(place[:, 1].double(), n)
     mass, line = _line_products(n)
     stiffness = torch.kron(line, mass) + UNEVEN * torch.kron(mass, line)
@@ -58,9 +90,7 @@ def _line_products(n: int, points: int = 2001) -> tuple[Tensor, Tensor]:
 def _by_smoothness(
     basis: Tensor, stiffness: Tensor, mass: Tensor, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
-    """Combinations of the centred columns that are orthogonal over the points and in slope; those without
-    points are dropped.
-    """
+    """Combinations of the columns, centred, orthogonal over the points and in slope; empty ones dropped."""
     centred = basis - basis.mean(0)
     values, vectors = torch.linalg.eigh(stiffness + 1e-6 * mass)
     whiten = vectors * values.rsqrt()

@@ -1,6 +1,4 @@
-"""From the loop's findings to a :class:`~nlos_lit.inference.result.Diagnosis`: numbers, intervals, and plain
-statements.
-"""
+"""From the loop's findings to a :class:`~nlos_lit.inference.result.Diagnosis`."""
 
 from __future__ import annotations
 
@@ -50,7 +48,20 @@ def assemble(
     seconds: float,
     seed: int,
 ) -> Diagnosis:
-    """Everything the report says."""
+    """Everything the report says.
+
+    Args:
+        capture: that was diagnosed.
+        found: by the loop.
+        split: of its spots.
+        scan: of the capture.
+        settings: of the criticism.
+        null: what toys of the base show; None where there are none.
+        numerics: changes of the deviance when only the computation is varied.
+        name: of the capture.
+        seconds: the diagnosis took.
+        seed: of it.
+    """
     base, final = found.base, found.final
     rows = tested_rows(final, split, settings.spots, seed)
     spots = split.fit[rows]
@@ -64,21 +75,22 @@ def assemble(
     )
     effects, groups, notes = [], [], []
     for turn in [] if verdicts.dominates else found.accepted:
-        p, feigned = weighed(turn.accepted.candidate, null, settings.level)
+        trial = _taken(turn)
+        p, feigned = weighed(trial.candidate, null, settings.level)
         if feigned:
             notes.append(
-                f"{turn.accepted.name} improved the fit,"
+                f"{trial.name} improved the fit,"
                 f" but captures simulated without it score as much (p = {p:.2g})"
             )
             continue
-        effect = next(e for e in final.extension.effects if e.name == turn.accepted.name)
+        effect = next(e for e in final.extension.effects if e.name == trial.name)
         again = next((e for e in fresh if e.name == effect.name), None)
         group = alternatives(turn, found.accepted)
         effects.append(_accepted(turn, effect, again, group, uncertainty, split, p))
         if group:
-            groups.append([turn.accepted.name, *group])
+            groups.append([trial.name, *group])
     if verdicts.dominates:
-        names = ", ".join(t.accepted.name for t in found.accepted)
+        names = ", ".join(_taken(t).name for t in found.accepted)
         notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
         final = base
     if found.wrong is not None:
@@ -104,14 +116,31 @@ def assemble(
 
 
 def weighed(candidate: Candidate, null: Null | None, level: float) -> tuple[float, bool]:
-    """p-value, by toys where there are any, and whether it was only they who spoke against the effect."""
+    """How sure an effect is.
+
+    Args:
+        candidate: that was screened.
+        null: what toys of the base show; None where there are none.
+        level: p-value up to which an effect is significant.
+
+    Returns:
+        p-value, by toys where there are any, and whether it was only they who spoke against the effect.
+    """
     p = candidate.p_value if null is None else null.p_value(candidate)
     return p, candidate.p_value <= level < p
 
 
 def alternatives(turn: Turn, accepted: list[Turn]) -> list[str]:
-    """A turn's group without what is needed beside its effect: that is no other name for it."""
-    names = {t.accepted.name for t in accepted}
+    """A turn's group without what is needed beside its effect: that is no other name for it.
+
+    Args:
+        turn: of the loop.
+        accepted: all turns that accepted an effect.
+
+    Returns:
+        Names of effects.
+    """
+    names = {_taken(t).name for t in accepted}
     return [name for name in turn.group if name not in names]
 
 
@@ -127,6 +156,11 @@ def _of_another_form(form: Form) -> str:
 
 def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
     """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain.
+
+    Args:
+        found: by the loop.
+        split: of the spots.
+        settings: of the criticism.
 
     A map that was taken back because it follows the count rate says so itself; another effect of the wrong
     form only where nothing else does.
@@ -149,29 +183,40 @@ def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdict
 
 
 def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: CriticismSettings) -> bool:
-    """Whether names hold less than the share ``explained`` of the misfit: of all that they gain and is left,
-    nats a spot; or, where most of what they were predicted to gain was of this very kind, of what the base
-    had of it.
+    """Whether names hold less than the share ``explained`` of the misfit.
+
+    That is of all that they gain and is left, nats a spot; or, where most of what they were predicted to gain
+    was of this very kind, of what the base had of it.
     """
     if not found.accepted:
         return False
     tested = tested_spots(found.final, split, settings.spots)
     spared = 1 - settings.explained
-    named = sum(t.accepted.gain.nats for t in found.accepted) / len(split.select)
+    named = sum(_taken(t).gain.nats for t in found.accepted) / len(split.select)
     if spared * named < settings.explained * left.gain / tested:
         return True
     had = next((d.gain for d in found.turns[0].discrepancies if (d.axis, d.of) == (left.axis, left.of)), 0.0)
     had *= tested / tested_spots(found.base, split, settings.spots)
-    predicted = sum(t.accepted.candidate.gain for t in found.accepted)
+    predicted = sum(_taken(t).candidate.gain for t in found.accepted)
     return had - left.gain > 0.5 * predicted and left.gain > spared * had
 
 
 def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
-    """Whether a rebuild with the effects is likelier than the base without them: else it got stuck, and says
-    nothing of them.
+    """Whether a rebuild got somewhere: it is likelier than the base. Else it says nothing of the effects.
+
+    Args:
+        again: the rebuild, with effects.
+        base: without them.
+        split: of the spots; those selected with decide.
     """
     with_, without = (float(log_likelihood(fit, split.select).sum()) for fit in (again, base))
     return with_ > without
+
+
+def _taken(turn: Turn) -> Trial:
+    """What a turn accepted, where it did."""
+    assert turn.accepted is not None
+    return turn.accepted
 
 
 def _accepted(
@@ -183,7 +228,7 @@ def _accepted(
     split: Split,
     p: float,
 ) -> Accepted:
-    trial = turn.accepted
+    trial = _taken(turn)
     return Accepted(
         name=effect.name,
         parameters=uncertainty.parameters(effect, again),
@@ -217,7 +262,7 @@ def _screened(candidate: Candidate, null: Null | None) -> Screened:
             step[p.name] = (
                 float(p.scale * candidate.step[part].square().mean().sqrt())
                 if p.size > 1
-                else float(p.null + p.scale * candidate.step[part])
+                else float((p.null or 0.0) + p.scale * candidate.step[part])
             )
         detectable[p.name] = float(SEEN**0.5 * p.scale * error.square().mean().sqrt())
         start += p.size

@@ -1,6 +1,4 @@
-"""Figures of a diagnosis. Functions take results and return figures; they compute nothing beyond counting and
-scaling.
-"""
+"""Figures of a diagnosis: functions take results and return figures; they count and scale, no more."""
 
 from __future__ import annotations
 
@@ -9,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -63,8 +62,12 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         shown["detection_limits"] = detection_limits(diagnosis.screened, bin_length)
     witness = diagnosis.witness or {}
     if witness.get("maps"):
-        walls = [p for p in diagnosis.profiles if p.axis == "wall" and p.edges_y is not None]
-        ends = (walls[0].edges[[0, -1]], walls[0].edges_y[[0, -1]]) if walls else None
+        walls = [
+            (p.edges[[0, -1]], p.edges_y[[0, -1]])
+            for p in diagnosis.profiles
+            if p.axis == "wall" and p.edges_y is not None
+        ]
+        ends = walls[0] if walls else None
         shown["witness_maps"] = witness_maps(witness["maps"], ends, witness.get("wall_gain_correlation"))
     if witness.get("tail_decay_fitted_m") is not None and witness.get("tail_decay_direct_m"):
         shown["witness_tail"] = witness_tail(witness["tail_decay_fitted_m"], witness["tail_decay_direct_m"])
@@ -73,8 +76,11 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
 
 @styled
 def residual_profile(profile: Profile, bin_length: float | None = None) -> Figure:
-    """Signed significance along an axis, before above after, on one scale; red beyond ±3σ. One panel where
-    nothing changed.
+    """Signed significance along an axis, before above after, on one scale; red beyond ±3σ.
+
+    Args:
+        profile: before and after; one panel where nothing changed.
+        bin_length: m; where it is known, the time axis is told in ns, too.
     """
     panels = _panels(profile)
     figure = Figure(figsize=(7.5, 0.9 + 1.9 * len(panels)))
@@ -113,18 +119,17 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
 
 @styled
 def residual_wall(profile: Profile) -> Figure:
-    """Signed significance over the wall, seen from it, before and after on one symmetric scale; one map where
-    nothing changed.
-    """
-    panels = _panels(profile)
+    """Signed significance over the wall, seen from it, before and after; one map where nothing changed."""
+    panels, edges_y = _panels(profile), profile.edges_y
+    assert edges_y is not None
     known = np.abs(np.concatenate([values[np.isfinite(values)] for values in panels.values()]))
     limit = max(3.0, float(np.quantile(known, 0.99))) if known.size else 3.0
-    high = np.ptp(profile.edges_y) / np.ptp(profile.edges)
+    high = np.ptp(edges_y) / np.ptp(profile.edges)
     figure = Figure(figsize=(0.9 + 4.3 * len(panels), min(7.0, 1.1 + 3.6 * high)))
     for axes, (name, values) in zip(
         figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
     ):
-        mesh = _map(axes, values, profile.edges, profile.edges_y, cmap=SIGNED, norm=Normalize(-limit, limit))
+        mesh = _map(axes, values, profile.edges, edges_y, cmap=SIGNED, norm=Normalize(-limit, limit))
         axes.set_title(f"{name}{_beyond(values)}", loc="left", fontsize="small")
         axes.set(xlabel=f"x ({profile.unit})", ylabel=f"y ({profile.unit})")
     colour_bar(mesh, "residual (σ), 99 % inside")
@@ -133,8 +138,11 @@ def residual_wall(profile: Profile) -> Figure:
 
 @styled
 def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()) -> Figure:
-    """Score statistic of every effect, ranked by predicted gain; grey and hatched where it can hardly be told
-    from the scene.
+    """Score statistic of every effect, ranked by predicted gain.
+
+    Args:
+        screened: grey and hatched where an effect can hardly be told from the scene.
+        accepted: names of effects that are ticked.
     """
     ranked = by_gain(screened)
     figure = Figure(figsize=(8, 1.3 + 0.27 * len(ranked)))
@@ -177,7 +185,12 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
 
 @styled
 def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = None) -> Figure:
-    """Each parameter with its 95 % interval, against the value that means "absent" (dashed)."""
+    """Each parameter with its 95 % interval, against the value that means "absent" (dashed).
+
+    Args:
+        effects: that were accepted.
+        bin_length: m, where known.
+    """
     rows = [(e.name, n, p) for e in effects for n, p in e.parameters.items()]
     figure = Figure(figsize=(8, 0.5 + 0.62 * len(rows)))
     for axes, (effect, name, p) in zip(figure.subplots(len(rows), 1, squeeze=False)[:, 0], rows, strict=True):
@@ -204,9 +217,7 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
 
 @styled
 def deviance_steps(diagnosis: Diagnosis) -> Figure:
-    """Deviance per bin on held-out spots after each accepted effect, and on the untouched spots; grey:
-    counting noise.
-    """
+    """Deviance per bin after each accepted effect, and on the untouched spots; grey: counting noise."""
     base, extended, test = diagnosis.base, diagnosis.extended, diagnosis.untouched_test
     steps = [("base", base.deviance_per_bin)]
     steps += [(f"+ {e.name}", e.heldout_gain.deviance_per_bin_after) for e in diagnosis.effects]
@@ -214,6 +225,7 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
     figure = Figure(figsize=(max(5.0, 1.1 * (len(steps) + 3)), 3.6))
     axes = figure.subplots()
     last = extended.deviance_noise if np.isfinite(extended.deviance_noise) else base.deviance_noise
+    groups: list[tuple[float, list[tuple[str, float]], np.ndarray, str, str]]
     groups = [(0, steps, np.linspace(base.deviance_noise, last, len(steps)), BLUE, "held-out spots")]
     names = [n for n in ("base", "extended") if n in test and (n == "base" or diagnosis.effects)]
     scored = [(f"untouched:\n{n}", test[n].deviance_per_bin) for n in names]
@@ -242,7 +254,7 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
             x + 0.35,
             color=GREY,
             linewidth=2.5,
-            label="counting noise" if start == 0 else None,
+            label="counting noise" if start == 0 else "",
         )
         for place, value in zip(x, y, strict=True):
             axes.annotate(
@@ -271,8 +283,11 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
 
 @styled
 def detection_limits(screened: Sequence[Screened], bin_length: float | None = None) -> Figure:
-    """Smallest amplitude that this capture would have revealed, a panel for each unit; grey where the scene
-    can imitate it.
+    """Smallest amplitude that this capture would have revealed, a panel for each unit.
+
+    Args:
+        screened: grey where the scene can imitate an effect.
+        bin_length: m, where known.
     """
     panels: dict[str, list[tuple[str, float, bool, bool]]] = {}
     for one in screened:
@@ -330,10 +345,12 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
 def witness_maps(
     maps: Mapping[str, Any], ends: tuple[np.ndarray, np.ndarray] | None = None, r: float | None = None
 ) -> Figure:
-    """Direct pulse's energy and the fitted wall gain, both over their mean, and one against the other; maps
-    ``[nx, ny]``.
+    """Direct pulse's energy and the fitted wall gain, both over their mean, and one against the other.
 
-    ``ends``: first and last edge of the wall in x and y, m; None counts spots.
+    Args:
+        maps: ``direct`` and ``fitted``, both ``[nx, ny]``.
+        ends: first and last edge of the wall in x and y, m; None counts spots.
+        r: their correlation.
     """
     relative = [
         values / np.nanmean(values)
@@ -347,7 +364,7 @@ def witness_maps(
         panels, relative, ("direct pulse (no fit saw it)", "fitted wall gain"), strict=False
     ):
         x, y = (
-            np.linspace(0, n, n + 1) if ends is None else np.linspace(*ends[k], n + 1)
+            np.linspace(0, n, n + 1) if ends is None else np.linspace(ends[k][0], ends[k][1], n + 1)
             for k, n in enumerate(values.shape)
         )
         mesh = _map(axes, values, x, y, cmap="cividis", norm=norm)
@@ -374,7 +391,12 @@ def witness_maps(
 
 @styled
 def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
-    """Decay of the fitted tail against the direct pulse's, early to late; all m of path."""
+    """Decay of the fitted tail against the direct pulse's.
+
+    Args:
+        fitted: m of path.
+        direct: m of path, early to late.
+    """
     factor, unit = scales_of("time", "m", fitted, None)[0]
     figure = Figure(figsize=(6, 1.7))
     axes = figure.subplots()
@@ -409,7 +431,7 @@ def _panels(profile: Profile) -> dict[str, np.ndarray]:
     return {"": profile.before} if same else {"before: ": profile.before, "after: ": profile.after}
 
 
-def _map(axes: Axes, values: np.ndarray, x: np.ndarray, y: np.ndarray, **options):
+def _map(axes: Axes, values: np.ndarray, x: np.ndarray, y: np.ndarray, **options: Any) -> QuadMesh:
     """``values`` [nx, ny] between edges ``x`` and ``y`` as seen from the wall: +x to the left, +y up."""
     mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(values).T, **options)
     axes.set(aspect="equal", facecolor=NOTHING)

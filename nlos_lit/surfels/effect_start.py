@@ -1,6 +1,4 @@
-"""Where scanned parameters of effects (delays, decays, periods) start: on their grids, where the counts ask
-for them most.
-"""
+"""Where scanned parameters of effects (delays, decays, periods) start: where the counts ask for them most."""
 
 from __future__ import annotations
 
@@ -14,8 +12,7 @@ from nlos_lit.surfels.model import SurfelModel
 
 @torch.no_grad()
 def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor) -> None:
-    """Set every effect that has scanned parameters to the best of its grid, its amplitudes to one scoring
-    step from their null.
+    """Set every effect that has scanned parameters to the best of its grid, its amplitudes to a scoring step.
 
     The step x maximises ``g·x - x·F x/2``, within bounds, with ``g = Σ (H/μ - 1) ∂μ/∂x`` and ``F = Σ ∂μ/∂x
     ∂μ/∂x / μ``; the best grid point is that of the largest maximum. Surfels and other effects are held, so
@@ -23,7 +20,10 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
     its grid.
 
     Args:
-        spots: ``[B]``. counts: ``[B, T_gate]`` of them.
+        model: the surfels.
+        extension: effects, which are changed.
+        spots: ``[B]`` indices into the scan.
+        counts: ``[B, T_gate]`` of them.
     """
 
     def arriving() -> Tensor:
@@ -39,15 +39,16 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
             continue
         effect.reset()
         base = expected(effect, light)
+        nulls = {p.name: p.null or 0.0 for p in effect.amplitudes}
         excess = counts / base - 1
         best, most = {}, 0.0
         for shape in effect.shape_grid():
             effect.set_all(shape)
             columns = []
             for p in effect.amplitudes:
-                effect.set(p.name, p.null + p.scale)
+                effect.set(p.name, nulls[p.name] + p.scale)
                 columns.append((expected(effect, light) - base) / p.scale)
-                effect.set(p.name, p.null)
+                effect.set(p.name, nulls[p.name])
             sensitivity = torch.stack(columns).flatten(1).double()
             score = sensitivity @ excess.flatten().double()
             information = (sensitivity / base.flatten()) @ sensitivity.T
@@ -55,13 +56,14 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
                 continue
             step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0]
             low, high = (
-                torch.tensor([getattr(p, b) - p.null for p in effect.amplitudes]) for b in ("lower", "upper")
+                torch.tensor([getattr(p, b) - nulls[p.name] for p in effect.amplitudes])
+                for b in ("lower", "upper")
             )
             step = step.clamp(low, high)
             gain = float(score @ step - step @ information @ step / 2)
             if gain > most:
                 best = shape | {
-                    p.name: p.null + float(x) for p, x in zip(effect.amplitudes, step, strict=True)
+                    p.name: nulls[p.name] + float(x) for p, x in zip(effect.amplitudes, step, strict=True)
                 }
                 most = gain
         effect.reset()

@@ -63,6 +63,9 @@ def measure(
         effects, values, exposure: as of :func:`~nlos_lit.effects.strengths.effects_at`; ``sensor`` is exposed
             already.
 
+    Returns:
+        The capture, counts of float or, with a seed, whole counts; and the truth that it shows.
+
     Raises:
         UserError: effects or values that do not exist or fit, a direct pulse, a gate that ends before the
             record.
@@ -79,6 +82,7 @@ def measure(
     capture, truth = simulate_capture(
         mesh, scan, sensor, None, two_sided=two_sided, detail=detail, progress=progress
     )
+    assert truth.gain is not None  # it is known of what was simulated
     intensity = truth.gain * scan.wall_albedo**2 / np.pi**3
     model = truth_surfels(mesh, capture, sensor, intensity, two_sided=two_sided, detail=detail)
     log.info("effects on %d spots × %d surfels", capture.n_spots, len(model))
@@ -96,7 +100,12 @@ def measure(
 
 
 def planned_scan(scan: ScanPlan, sensor: SensorModel) -> Scan:
-    """What effects know of a scan that has not been measured yet."""
+    """What effects know of a scan that has not been measured yet.
+
+    Args:
+        scan: its points and bins.
+        sensor: for the level of the counts.
+    """
     laser, point = scan.points()
     up = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
     level = sensor.mean_counts / scan.n_bins + sensor.background
@@ -120,8 +129,12 @@ def truth_surfels(
     capture's.
 
     Args:
+        mesh: the hidden scene.
         capture: wall points and time bins.
+        sensor: its response and background.
         intensity: counts per unit of H_r.
+        two_sided: triangles reflect on both sides.
+        detail: factor on the number of patches along a line.
     """
     ends = np.concatenate(
         [np.c_[capture.laser, capture.laser_normal], np.c_[capture.sensor, capture.sensor_normal]]
@@ -163,8 +176,14 @@ def truth_surfels(
 
 @torch.no_grad()
 def expected_counts(model: SurfelModel, effects: list[Effect]) -> Tensor:
-    """``[S, T]`` expected counts of all spots; the laser cycles of pile-up are such that its ``detections``
-    are those recorded.
+    """Expected counts of all spots.
+
+    Args:
+        model: of the light.
+        effects: in the order in which they act; each settles on the light there is (:meth:`Effect.settle`).
+
+    Returns:
+        ``[S, T]``.
     """
     spots = torch.arange(len(model.laser))
     counting = [effect for effect in effects if effect.stage == "counting"]
