@@ -1,4 +1,4 @@
-"""What effects know about the scan: where each spot lies on the wall, when it was taken, how time is binned."""
+"""What effects know about the scan: where and when each spot was taken, how time is binned."""
 
 from __future__ import annotations
 

@@ -14,11 +14,11 @@ from torch import Tensor
 
 
 class EvenAxis:
-    """One axis of a convolution whose kernel is even: voxel m lies ``m + offset - n`` steps from aperture
-    point n.
+    """One axis of a convolution whose kernel is even.
 
-    The kernel's centre is put at index 0 and the transform is long enough to hold it mirrored, so that halves
-    of the kernel and of its spectrum are all there is; ``shift`` brings voxel 0 back to index 0.
+    Voxel m lies ``m + offset - n`` steps from aperture point n. The kernel's centre is put at index 0 and the
+    transform is long enough to hold it mirrored, so that halves of the kernel and of its spectrum are all
+    there is; ``shift`` brings voxel 0 back to index 0.
 
     Args:
         n: aperture points.

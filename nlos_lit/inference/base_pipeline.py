@@ -23,8 +23,11 @@ from nlos_lit.surfels.refine import refine
 class BasePipeline:
     """From counts to fitted surfels; picklable, so that toys can go through all of it in other processes.
 
-    ``volume``: arguments of :func:`~nlos_lit.capture.volume_grid.volume_grid`. ``budget``: bytes for the
-    phasor field.
+    Args:
+        volume: arguments of :func:`~nlos_lit.capture.volume_grid.volume_grid`.
+        model: of the image.
+        surfels: of the fit.
+        budget: bytes for the phasor field.
     """
 
     volume: Mapping[str, Any]
@@ -50,7 +53,18 @@ class BasePipeline:
         extension: Extension,
         seed: int,
     ) -> SurfelFit:
-        """Surfels from new seeds, with the given effects."""
+        """Surfels from new seeds, with the given effects.
+
+        Args:
+            capture: raw counts.
+            split: whose ``fit`` spots are fitted.
+            image: ``[nz, nx, ny]`` and its grid, from :meth:`image`.
+            extension: effects, fitted along in place.
+            seed: of batches and tested spots.
+
+        Returns:
+            the fit, converged.
+        """
         return refine(capture, *image, self.surfels, split.fit, extension=extension, seed=seed).fit
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:

@@ -80,10 +80,16 @@ class CriticismSettings:
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of the loop: the screening, the rivals, who was accepted (None ends it), and the fits without
-    another effect.
+    """One turn of the loop.
 
-    ``form``: of the effect that was accepted before, where it is wrong.
+    Args:
+        candidates: the screening, largest predicted gain first.
+        discrepancies: flexible ones, largest gain first.
+        trials: the rivals after their refits, most evidence first.
+        accepted: one of them; None ends the loop.
+        group: names that the capture cannot tell from the accepted one.
+        controls: fits without another effect.
+        form: of the effect that was accepted before, where it is wrong.
     """
 
     candidates: list[Candidate]
@@ -96,20 +102,47 @@ class Turn:
 
 
 def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
-    """How many fitted spots score tests look at, ``most`` or as many as ``WORK`` products allow; gains are
-    nats over these.
+    """How many fitted spots score tests look at; gains are nats over these.
+
+    Args:
+        fit: whose surfels make the columns.
+        split: whose ``fit`` spots there are.
+        most: spots; fewer where their products would exceed ``WORK``.
+
+    Returns:
+        a number of spots.
     """
     columns = 2 * len(fit.model) + 64
     return min(most, len(split.fit), max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
 
 
 def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
-    """Rows of ``split.fit`` that are looked at."""
+    """Which fitted spots score tests look at.
+
+    Args:
+        fit: that is tested.
+        split: of its spots.
+        most: see :func:`tested_spots`.
+        seed: of the choice.
+
+    Returns:
+        sorted rows of ``split.fit`` (and of the fit's counts).
+    """
     return np.sort(np.random.default_rng(seed).permutation(len(split.fit))[: tested_spots(fit, split, most)])
 
 
 def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[Problem, torch.Tensor]:
-    """The weighted least-squares problem of tested spots, and their folds."""
+    """The weighted least-squares problem of tested spots.
+
+    Args:
+        fit: that is tested.
+        split: of its spots.
+        most: see :func:`tested_spots`.
+        seed: of the choice.
+
+    Returns:
+        the problem of S spots, and ``[S]`` their folds.
+    """
     rows = tested_rows(fit, split, most, seed)
     spots = torch.from_numpy(split.fit[rows])
     return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
@@ -119,8 +152,11 @@ def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[
 class Look:
     """Effects and flexible discrepancies as the score tests see them.
 
-    ``own`` ``[P]``: the step that the base alone would take. ``form``: of the effect asked about, where it is
-    wrong.
+    Args:
+        candidates: effects, largest predicted gain first.
+        discrepancies: flexible ones, largest gain first.
+        own: ``[P]`` the step that the base alone would take.
+        form: of the effect asked about, where it is wrong.
     """
 
     candidates: list[Candidate]
@@ -130,8 +166,18 @@ class Look:
 
 
 def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, latest: str = "") -> Look:
-    """Screen all effects that the fit does not have yet, and the flexible discrepancies; look at the form of
-    ``latest``.
+    """Screen all effects that the fit does not have yet, and the flexible discrepancies.
+
+    Args:
+        fit: that is criticised.
+        split: of its spots.
+        scan: of the capture.
+        s: settings.
+        seed: of the spots that are looked at.
+        latest: name of the effect whose form is looked at, too.
+
+    Returns:
+        what the tests say; nothing but the form where that is wrong.
     """
     problem, folds = tested_problem(fit, split, s.spots, seed)
     have = {e.name for e in fit.extension.effects}
@@ -173,6 +219,19 @@ def turn(
     Where the base is far off, linear tests around it say little about effects that bend single paths: these
     are rebuilt with, too. Else, where a function of the count rate says more than any effect, the counting is
     none that the registry knows: no rivals.
+
+    Args:
+        fit: with the effects accepted so far.
+        rebuild: a fit from new seeds with given effects and random seed.
+        split: of the spots.
+        scan: of the capture.
+        s: settings.
+        seed: of everything random.
+        steps: says and keeps what is done.
+        latest: name of the effect that was accepted last.
+
+    Returns:
+        the turn; its ``accepted`` is None where no effect is asked for.
     """
     number = len(fit.extension.effects) + 1
     steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
@@ -191,7 +250,10 @@ def turn(
     rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
     steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
     own = partial(refit_with, fit, [], s.steps, seed, seen.own)
-    controls = [fit, steps("refit", "refitting the control", f"turn{number}_control", own)]
+    controls: list[SurfelFit | None] = [
+        fit,
+        steps("refit", "refitting the control", f"turn{number}_control", own),
+    ]
     tries = []
     for c in rivals:
         refit = partial(refit_with, fit, [c], s.steps, seed)
@@ -252,18 +314,34 @@ def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int) -> SurfelFit | N
 
 
 def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
-    """``[S]`` log-likelihoods of the select spots of the best of several fits; None are skipped."""
+    """Log-likelihoods of the select spots of the best of several fits.
+
+    Args:
+        fits: that are compared; None are skipped.
+        split: of the spots.
+
+    Returns:
+        ``[S]`` nats.
+    """
     found = [log_likelihood(f, split.select) for f in fits if f is not None]
     return max(found, key=lambda values: float(values.sum()))
 
 
 def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: bool = False) -> float:
-    """Nats over the tested spots that an effect must promise, or gain once the scene is ``rebuilt``;
-    ``over``: the misfit there.
+    """Nats over the tested spots that an effect must promise, or gain once the scene is rebuilt.
 
     A base that has not quite converged is off along what it could imitate, and what is left of an effect
     takes that for its own: nats in inverse proportion to the retained information. Below ``WELL`` the rebuilt
     scene must gain as much more.
+
+    Args:
+        candidate: the effect.
+        s: settings.
+        over: misfit of the tested spots, nats.
+        rebuilt: of a rebuilt scene, not of the screening.
+
+    Returns:
+        nats.
     """
     least = s.least_gain if candidate.effect.moves_light else s.least_shape
     scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) if rebuilt else 1.0
@@ -271,14 +349,31 @@ def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: boo
 
 
 def misfit_and_noise(fit: SurfelFit, split: Split) -> tuple[float, float]:
-    """Misfit beyond noise, and noise: nats over as many spots as were fitted, measured on the select spots."""
+    """Misfit beyond noise, and noise, measured on the select spots.
+
+    Args:
+        fit: that is judged.
+        split: of the spots.
+
+    Returns:
+        both in nats over as many spots as were fitted.
+    """
     scores = score(fit, split.select)
     nats = fit.counts.shape[1] * len(split.fit) / 2
     return (scores.deviance_per_bin - scores.deviance_noise) * nats, scores.deviance_noise * nats
 
 
 def significant(candidates: list[Candidate], s: CriticismSettings, over: float) -> list[Candidate]:
-    """Those whose Holm-adjusted p-value and predicted gain pass, the largest predicted gain first."""
+    """Candidates whose Holm-adjusted p-value and predicted gain pass.
+
+    Args:
+        candidates: largest predicted gain first.
+        s: settings.
+        over: misfit of the tested spots, nats.
+
+    Returns:
+        those that pass, in the same order.
+    """
     order = sorted(candidates, key=lambda c: c.p_value)
     passed, worst = set(), 0.0
     for rank, candidate in enumerate(order):
@@ -291,8 +386,13 @@ def significant(candidates: list[Candidate], s: CriticismSettings, over: float) 
 
 @dataclass
 class Findings:
-    """What the loop leaves behind: the base, every turn, the final extended fit, and the same ``again`` from
-    new seeds.
+    """What the loop leaves behind.
+
+    Args:
+        base: the fit without effects.
+        final: the fit with all effects that were kept.
+        turns: of the loop.
+        again: the final fit from new seeds; None without effects, or where no surfel survived.
     """
 
     base: SurfelFit
@@ -331,7 +431,14 @@ def criticise(
         base: fitted to ``split.fit`` without effects.
         rebuild: a fit from new seeds with the given effects, begun at their present values, and the given
             random seed: surfels that imitated an effect do not come back.
+        split: of the spots.
+        scan: of the capture.
+        s: settings.
+        seed: of everything random.
         steps: says and keeps what is done.
+
+    Returns:
+        base, turns and final fit.
     """
     fit = before = base
     turns, latest, steps = [], "", steps or Steps()

@@ -41,19 +41,28 @@ def diagnose(
 
     Args:
         capture: raw counts; nothing else about the measurement is known.
+        pipeline: image and fit of the base.
+        options: of the criticism.
+        name: of the capture, for the report.
+        seed: of everything random.
         image: ``[nz, nx, ny]`` and its grid, where a run has made it already.
         folder: where finished steps and toys are kept, so that an interrupted diagnosis with the same
             arguments goes on; needed with ``options.toys``.
-        settings, report: see :class:`~nlos_lit.runtime.steps.Steps`.
+        settings: all that results depend on, see :class:`~nlos_lit.runtime.steps.Steps`.
+        report: called as steps begin, see :class:`~nlos_lit.runtime.steps.Steps`.
+
+    Returns:
+        the diagnosis, and the fits behind it.
 
     Raises:
-        UserError: the scan is too small to be split, the capture holds no counts but expectations, or no
-            surface is found.
+        UserError: the scan is too small to be split, the capture holds no counts but expectations, no surface
+            is found, or kept steps are damaged or of other settings.
     """
     began = time.perf_counter()
     if not capture.is_counts:
         raise UserError(
-            "a diagnosis weighs photon counts; this capture holds expected values (a render): draw counts first"
+            "a diagnosis weighs photon counts; this capture holds expected values (a render): "
+            "draw counts first"
         )
     split, scan = split_spots(capture), Scan.of(capture)
     steps = Steps(report, None if folder is None else folder / "steps", settings, kinds(scan))
@@ -80,6 +89,7 @@ def diagnose(
     found = criticise(base, rebuild, split, scan, options, seed, steps)
     null = None
     if options.toys:
+        assert folder is not None, "toys are kept in a folder"
         null = run_toys(capture, base, pipeline, split, options, folder / "toys", report)
     checks = {}
     if options.numerics:

@@ -32,8 +32,15 @@ SMOOTH = 0.5
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """``gain`` nats (cross-validated); ``statistic`` of ``degrees`` columns; ``of``: the per-spot effect
-    smoothed, or "".
+    """What an axis says by itself.
+
+    Args:
+        axis: ``time``, ``wall``, ``scan``, ``rate`` or two of them.
+        gain: nats, cross-validated.
+        statistic: of the score test.
+        degrees: columns of it.
+        p_value: of the statistic.
+        of: the per-spot effect smoothed, or "".
     """
 
     axis: str
@@ -47,16 +54,25 @@ class Discrepancy:
 def discrepancies(
     problem: Problem, projector: Projector, scan: Scan, per_spot: Sequence[Effect] = ()
 ) -> list[Discrepancy]:
-    """One for each axis, and two for each per-spot effect; the largest gain first.
+    """One discrepancy for each axis, and two for each per-spot effect; the largest gain first.
 
     Stretches of a raster are stripes of the wall: a map of the wall that holds nothing beyond the order of
     the scan is left out.
+
+    Args:
+        problem: of the tested spots.
+        projector: takes off what the base can explain.
+        scan: of the capture.
+        per_spot: effects whose numbers may be smooth along wall or scan.
+
+    Returns:
+        what each says.
     """
     root = problem.expected.sqrt()
     asked = {"": (root, tuple(BANDS))}
     for effect in per_spot:
         asked[effect.name] = weighted_columns(problem, effect)[:, 0].view(root.shape), ("scan", "wall")
-    found = []
+    found: list[Discrepancy] = []
     for of, (column, axes) in asked.items():
         tests = {axis: _test(column, problem, projector, (axis,), scan, of) for axis in axes}
         if tests["wall"].gain > tests["scan"].gain > SMOOTH * tests["wall"].gain:
@@ -68,21 +84,40 @@ def discrepancies(
 
 
 def smooth(found: list[Discrepancy], name: str, gain: float) -> bool:
-    """Whether neighbours share much of what a per-spot effect gains (nats), so that its numbers are not
-    independent.
+    """Whether neighbours share much of what a per-spot effect gains.
+
+    Its numbers are then not independent.
+
+    Args:
+        found: discrepancies.
+        name: of the effect.
+        gain: of the effect by itself, nats.
+
+    Returns:
+        whether a smoothed one holds more than the share ``SMOOTH``.
     """
     return any(d.of == name and d.gain > SMOOTH * gain for d in found)
 
 
 def counted(found: list[Discrepancy]) -> float:
-    """Nats that a function of the count rate gains; of an effect of the registry it never holds as much as
-    the effect itself.
+    """Nats that a function of the count rate gains.
+
+    Of an effect of the registry it never holds as much as the effect itself.
     """
     return next(d.gain for d in found if d.axis == "rate")
 
 
 def bands(problem: Problem, axis: str, scan: Scan) -> Tensor:
-    """``[S]`` (wall, scan, rate) or ``[T]`` (time) band of each spot or bin."""
+    """The band of each spot or bin along an axis.
+
+    Args:
+        problem: of the tested spots.
+        axis: ``time``, ``wall``, ``scan`` or ``rate``.
+        scan: of the capture.
+
+    Returns:
+        ``[S]`` (wall, scan, rate) or ``[T]`` (time) numbers of bands.
+    """
     number = BANDS[axis]
     if axis == "time":
         return torch.arange(problem.bins) * number // problem.bins
@@ -108,11 +143,18 @@ def _test(
 
 
 def flexible(columns: Tensor, problem: Problem, projector: Projector) -> tuple[float, float, int, float]:
-    """Gain (nats, cross-validated over random spots), statistic, degrees and p-value of weighted columns
-    ``[S, T, k]``.
+    """Score test of weighted columns, cross-validated over random spots.
 
     Combinations that the base can imitate (``RETAINED``) are left out: their scores and information are
     rounding errors.
+
+    Args:
+        columns: ``[S, T, k]``, divided by √μ.
+        problem: of the S spots.
+        projector: takes off what the base can explain.
+
+    Returns:
+        gain (nats), statistic, degrees and p-value.
     """
     spots, bins, k = columns.shape
     raw = columns.reshape(-1, k)

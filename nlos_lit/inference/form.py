@@ -52,15 +52,26 @@ class Form:
 
     @property
     def wrong(self) -> bool:
-        """The strength varies by more than 70 % (root mean square) of itself, or 85 % of the map follow the
-        count rate.
+        """Whether the strength varies too much for one equation.
+
+        By more than 70 % (root mean square) of itself, or 85 % of the map follow the count rate.
         """
         share, level = LIMITS[self.axis]
         return self.p_value < level and self.gain > share * self.own
 
 
 def forms_of(problem: Problem, projector: Projector, effect: Effect) -> list[Form]:
-    """Test an effect of the problem's extension; nothing for a per-spot effect, which has no common strength."""
+    """Test an effect of the problem's extension.
+
+    Args:
+        problem: of the tested spots, with the effect.
+        projector: takes off what base and effects can explain.
+        effect: one of the extension's.
+
+    Returns:
+        its forms along time and, for a map, along the count rate; none for a per-spot effect, which has no
+        common strength.
+    """
     if effect.per_spot:
         return []
     without = Extension([null_of(e) if e is effect else e for e in problem.extension.effects])
@@ -83,13 +94,16 @@ def _over_time(problem: Problem, projector: Projector, effect: Effect, change: T
 
 @torch.no_grad()
 def _over_rate(problem: Problem, effect: SmoothEffect, change: Tensor, rate: Tensor) -> Form:
-    """Only maps that fall as the rate grows count: no detector sees better for more light, but a wall is lit
-    most where a scene is.
+    """Only maps that fall as the rate grows count.
+
+    No detector sees better for more light, but a wall is lit most where a scene is. The p-value is the
+    share of maps drawn from the prior that follow the rate as well.
 
     Args:
-        change: ``[S, T]`` Δμ/√μ. rate: ``[S]`` counts without the effect.
-
-    p: share of maps drawn from the prior that follow the rate as well.
+        problem: of the tested spots.
+        effect: a smooth map.
+        change: ``[S, T]`` Δμ/√μ.
+        rate: ``[S]`` counts without the effect.
     """
     field = effect.field(problem.spots).double()
     worth = change.double().square().sum(1)

@@ -26,14 +26,23 @@ MOST_DEPTH, MOST_DARKER, MOST_BRIGHTER, MOST_RESPONSE = (
 
 
 def set_step(effect: Effect, step: Tensor) -> None:
-    """Move an effect's stored amplitudes by ``step`` ``[k]`` (all amplitudes in order), within bounds."""
+    """Move an effect's stored amplitudes, within bounds.
+
+    Args:
+        effect: that is moved, in place.
+        step: ``[k]`` all amplitudes in order.
+    """
     _add(effect, step, shapes=False)
 
 
 @torch.no_grad()
 def move_base(fit: SurfelFit, present: Extension, step: Tensor) -> None:
-    """Move surfels, response and the ``present`` effects by nuisance coefficients ``[P]`` in the order of the
-    columns.
+    """Move surfels, response and present effects by coefficients of the nuisance columns.
+
+    Args:
+        fit: whose model is moved, in place.
+        present: effects that have columns.
+        step: ``[P]`` in the order of the columns.
     """
     model = fit.model
     m, fields = len(model), tilt_fields(model)
@@ -63,8 +72,15 @@ def _add(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
 
 @torch.no_grad()
 def shift(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
-    """Add the first numbers of ``step`` to the stored values, without regard to bounds; the numbers that are
-    left.
+    """Add the first numbers of a step to an effect's stored values, without regard to bounds.
+
+    Args:
+        effect: that is moved, in place.
+        step: ``[k]`` or longer.
+        shapes: after the amplitudes, its shapes are moved, too.
+
+    Returns:
+        the numbers that are left.
     """
     for p in effect.amplitudes + (effect.shapes if shapes else []):
         getattr(effect, f"raw_{p.name}").add_(step[: p.size])
@@ -75,12 +91,19 @@ def shift(effect: Effect, step: Tensor, shapes: bool) -> Tensor:
 def best_start(
     fit: SurfelFit, extra: list[Effect], steps: list[Tensor], beside: Tensor | None, seed: int
 ) -> SurfelFit:
-    """A copy of the fit with ``extra`` effects, begun where the tested spots are likeliest: steps of the
-    effects with the base left alone, or joint steps of several lengths.
+    """A copy of the fit with more effects, begun where the tested spots are likeliest.
+
+    Tried are steps of the effects with the base left alone, and joint steps of several lengths.
 
     Args:
-        steps: ``[k]`` of each extra effect's stored amplitudes. beside: ``[P]`` what the base does at the
-            same time, None for nothing.
+        fit: that is copied.
+        extra: effects at their nulls.
+        steps: ``[k]`` of each extra effect's stored amplitudes.
+        beside: ``[P]`` what the base does at the same time, None for nothing.
+        seed: of the copy's batches.
+
+    Returns:
+        the copy; nothing is run.
     """
 
     def begun(length: float, moved: Tensor | None) -> SurfelFit:
@@ -102,7 +125,15 @@ def best_start(
 
 
 def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
-    """A copy of the extension with more effects at their present values, in order of application."""
+    """A copy of the extension with more effects at their present values, in order of application.
+
+    Args:
+        extension: that is copied.
+        extra: effects, copied too.
+
+    Returns:
+        a new extension.
+    """
     return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
 
 

@@ -13,7 +13,18 @@ from nlos_lit.surfels.fit import SurfelFit
 
 
 def drop_needless(fit: SurfelFit, split: Split, batches: int, seed: int, steps: Steps) -> SurfelFit:
-    """Backward: an effect accepted early may be explained by those that came later."""
+    """Backward: an effect accepted early may be explained by those that came later.
+
+    Args:
+        fit: with all accepted effects.
+        split: of the spots.
+        batches: of each refit.
+        seed: of the batches.
+        steps: says and keeps what is done.
+
+    Returns:
+        the fit without needless effects; at least one stays.
+    """
     block = split.block[split.select]
     while len(fit.extension.effects) > 1:
         names = [e.name for e in fit.extension.effects]

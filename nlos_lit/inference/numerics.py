@@ -24,10 +24,19 @@ def numerics(
     seed: int,
     other: SurfelFit | None = None,
 ) -> dict[str, float]:
-    """Change of the select spots' deviance per bin with another seed, and with finer quadrature of the fitted
-    surfels.
+    """How much the select spots' deviance per bin changes with numerics alone.
 
-    ``other``: a fit with another seed, where there is one.
+    Args:
+        pipeline: image and fit of the base.
+        capture: that was fitted.
+        split: of the spots.
+        image: ``[nz, nx, ny]`` and its grid.
+        base: the fit.
+        seed: of the base.
+        other: a fit with another seed, where there is one.
+
+    Returns:
+        changes by another seed, and by finer quadrature of the fitted surfels.
     """
     reference = score(base, split.select).deviance_per_bin
     if other is None:

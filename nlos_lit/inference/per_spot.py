@@ -34,7 +34,22 @@ def sparse(effect: Effect) -> bool:
 
 
 def factors(score: Tensor, information: Tensor, width: float, share: float, positive: bool) -> Tensor:
-    """``[S]`` log marginal likelihood ratio of each spot against no effect."""
+    """Log marginal likelihood ratio of each spot against no effect, see the module's equation.
+
+    Args:
+        score: ``[S]`` of the spot's own coefficient at 0.
+        information: ``[S]`` of it, > 0.
+        width: σ of the coefficients.
+        share: π of the spots that have one.
+        positive: coefficients are half normal and sparse.
+
+    Returns:
+        ``[S]`` nats.
+
+    Examples:
+        >>> factors(torch.tensor([0.0, 4.0]), torch.tensor([1.0, 1.0]), 1.0, 1.0, False)
+        tensor([-0.3466,  3.6534])
+    """
     grown = 1 + width**2 * information
     factor = 0.5 * width**2 * score**2 / grown - 0.5 * grown.log()
     if not positive:
@@ -44,8 +59,15 @@ def factors(score: Tensor, information: Tensor, width: float, share: float, posi
 
 
 def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[float, float, float]:
-    """Gain (nats), width and share that maximise the marginal likelihood; gain 0 where nothing does better
-    than none.
+    """The distribution of coefficients that maximises the marginal likelihood.
+
+    Args:
+        score: ``[S]`` see :func:`factors`.
+        information: ``[S]``.
+        positive: coefficients are half normal and sparse.
+
+    Returns:
+        gain (nats), width and share; gain 0 where nothing does better than none.
     """
     typical = float(information.median().clamp_min(1e-30).rsqrt())
     best = (0.0, 0.0, 1.0)
@@ -68,7 +90,23 @@ def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[floa
 
 
 def coefficients(score: Tensor, information: Tensor, width: float, positive: bool) -> Tensor:
-    """``[S]`` posterior means; sparse ones only where they stand out by 3.5 standard deviations."""
+    """Each spot's coefficient.
+
+    Args:
+        score: ``[S]`` see :func:`factors`.
+        information: ``[S]``.
+        width: σ of the coefficients.
+        positive: they are sparse: only those count that stand out by 3.5 standard deviations.
+
+    Returns:
+        ``[S]`` posterior means.
+
+    Examples:
+        >>> coefficients(torch.tensor([2.0, 6.0]), torch.tensor([1.0, 1.0]), 1.0, False)
+        tensor([1., 3.])
+        >>> coefficients(torch.tensor([2.0, 6.0]), torch.tensor([1.0, 1.0]), 1.0, True)
+        tensor([0., 6.])
+    """
     if positive:
         return torch.where(
             score > 3.5 * information.sqrt(), score / information.clamp_min(1e-30), torch.zeros_like(score)
@@ -79,8 +117,17 @@ def coefficients(score: Tensor, information: Tensor, width: float, positive: boo
 def spot_scores(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Score and information ``[S]`` of each spot's own coefficient at its present value, and expected counts
-    ``[S, T]``.
+    """Score and information of each spot's own coefficient at its present value.
+
+    Args:
+        model: of the counts.
+        extension: present effects.
+        effect: a per-spot effect, of the extension or beside it.
+        spots: ``[S]`` rows of the capture.
+        counts: ``[S, T]`` of them.
+
+    Returns:
+        score ``[S]``, information ``[S]``, and expected counts ``[S, T]``.
     """
     with torch.no_grad():
         expected = model.expected(spots, extension).double().clamp_min(1e-6)
@@ -92,8 +139,17 @@ def spot_scores(
 def solve(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor, rounds: int = 4
 ) -> None:
-    """Set the coefficients of ``spots`` to their posterior means by Newton steps, the width re-estimated from
-    their scatter.
+    """Set a per-spot effect's coefficients to their posterior means by Newton steps.
+
+    The width is estimated anew from their scatter.
+
+    Args:
+        model: of the counts.
+        extension: present effects.
+        effect: one of them; in place.
+        spots: ``[S]`` rows of the capture.
+        counts: ``[S, T]`` of them.
+        rounds: Newton steps.
     """
     p = effect.amplitudes[0]
     raw = getattr(effect, f"raw_{p.name}")

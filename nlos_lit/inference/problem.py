@@ -37,10 +37,15 @@ class Problem:
     """Everything about one model and one set of spots that screening needs.
 
     Args:
-        spots: ``[S]``, one row block of ``bins`` rows each. expected: ``[S, bins]`` μ.
-        nuisance: ``[S·bins, P]`` X. prior: ``[P]`` precision of each nuisance column's coefficient.
-        residual: ``[S·bins]``. transients: ``[S, T]`` light on arrival, which response, spot and counting
-            effects start from.
+        model: of the counts.
+        extension: present effects.
+        spots: ``[S]``, one row block of ``bins`` rows each.
+        counts: ``[S, bins]``.
+        expected: ``[S, bins]`` μ.
+        nuisance: ``[S·bins, P]`` X.
+        prior: ``[P]`` precision of each nuisance column's coefficient.
+        residual: ``[S·bins]``.
+        transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
     """
 
     model: SurfelModel
@@ -61,9 +66,17 @@ class Problem:
 def build_problem(
     model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor, with_effects: bool = True
 ) -> Problem:
-    """Nuisance columns and residual of ``spots`` ``[S]`` with gated counts ``[S, T_gate]``.
+    """Nuisance columns and residual of some spots.
 
-    ``with_effects``: parameters of the extension's effects are nuisance, too.
+    Args:
+        model: of the counts.
+        extension: present effects.
+        spots: ``[S]`` rows of the capture.
+        counts: ``[S, T_gate]`` of them.
+        with_effects: parameters of the extension's effects are nuisance, too.
+
+    Returns:
+        the problem.
     """
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
@@ -104,11 +117,18 @@ def effect_columns(
     shapes: bool = False,
     transients: Tensor | None = None,
 ) -> Tensor:
-    """``[S·bins, k]`` ∂μ/∂(stored amplitudes) of an effect at its present values, beside those of the
-    extension.
+    """∂μ/∂(stored values) of an effect at its present values, beside those of the extension.
 
-    ``shapes``: also by its shape parameters (after the amplitudes). A per-spot effect gives one column: every
-    spot's own. ``transients``: ``[S, T]`` of these spots, where they are known already.
+    Args:
+        model: of the counts.
+        extension: present effects.
+        spots: ``[S]`` rows of the capture.
+        effect: one of the extension's, or another.
+        shapes: also by its shape parameters (after the amplitudes).
+        transients: ``[S, T]`` of these spots, where they are known already.
+
+    Returns:
+        ``[S·bins, k]``; a per-spot effect gives one column: every spot's own.
     """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
@@ -135,7 +155,16 @@ def effect_columns(
 
 
 def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
-    """:func:`effect_columns` of a problem's spots, divided by √μ."""
+    """:func:`effect_columns` of a problem's spots, divided by √μ.
+
+    Args:
+        problem: of the spots.
+        effect: one of the extension's, or another.
+        shapes: also by its shape parameters.
+
+    Returns:
+        ``[S·bins, k]``.
+    """
     columns = effect_columns(
         problem.model, problem.extension, problem.spots, effect, shapes, problem.transients
     )
@@ -172,9 +201,7 @@ def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor
 def _staged(
     model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, transients: Tensor | None
 ) -> _Forward:
-    """The part of the forward model that comes after what ``effect`` cannot change, with the part before
-    worked out.
-    """
+    """The part of the forward model after what an effect cannot change, the part before worked out."""
     if effect.needs_paths:
         paths = model.paths(spots)
         return _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
@@ -203,18 +230,19 @@ def _surfel_columns(
 
 @torch.no_grad()
 def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
-    """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), exact for any response, gain and counting stage."""
+    """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), for any response, gain and counting stage."""
     b, t = transients.shape
     repeated, again = transients.repeat_interleave(t, 0), spots.repeat_interleave(t)
     unit = torch.eye(t).repeat(b, 1)
-    _, rows = torch.func.jvp(lambda x: model.record(x, again, extension), (repeated,), (unit,))
+    rows = torch.func.jvp(lambda x: model.record(x, again, extension), (repeated,), (unit,))[1]
     return rows.view(b, t, t)[:, :, model.gate[0] :].transpose(1, 2)
 
 
 @torch.no_grad()
 def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor) -> Tensor:
-    """``[B, T, 2M + 2F]`` derivatives of the transients by albedos (in units of themselves), depths (in bins)
-    and tilts.
+    """``[B, T, 2M + 2F]`` derivatives of the transients.
+
+    By albedos (in units of themselves), depths (in bins) and tilts.
     """
     centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
     unit = albedo_unit(albedo)
@@ -236,7 +264,8 @@ def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, 
     blocks = []
     for k, direction in enumerate((unit, one, one, one)):
         step = tuple(direction if i == k else zero for i in range(4))
-        (energy, time), (d_energy, d_time) = torch.func.jvp(place, start, step)
+        both = torch.func.jvp(place, start, step)
+        (energy, time), (d_energy, d_time) = both[0], both[1]
         first, weights = spline_weights(time)
         values = d_energy[..., None] * weights
         if k:

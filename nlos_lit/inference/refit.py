@@ -20,8 +20,12 @@ BOOTSTRAP = 400
 
 @dataclass(frozen=True)
 class Comparison:
-    """Gain of one model over another, nats, with the standard error and 95 % interval by bootstrap over wall
-    blocks.
+    """Gain of one model over another.
+
+    Args:
+        nats: the gain.
+        error: its standard error by bootstrap over wall blocks.
+        interval: of 95 %, likewise.
     """
 
     nats: float
@@ -34,8 +38,16 @@ def refit_with(
 ) -> SurfelFit:
     """Warm-started joint refit with more effects (none: the control), begun at their one-step estimates.
 
-    ``beside`` ``[P]``: what the base does at the same time; None takes that of a single candidate, and
-    nothing for several.
+    Args:
+        fit: that is copied.
+        candidates: whose effects are added.
+        steps: batches (and as many again at falling rate).
+        seed: of the batches.
+        beside: ``[P]`` what the base does at the same time; None takes that of a single candidate, and
+            nothing for several.
+
+    Returns:
+        the refitted copy.
     """
     if beside is None and len(candidates) == 1:
         beside = candidates[0].beside
@@ -51,8 +63,14 @@ def refit_with(
 
 
 def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
-    """``[S]`` Poisson log-likelihood of each spot that was not fitted (without ln k!), marginal over per-spot
-    effects.
+    """Poisson log-likelihood of spots that were not fitted (without ln k!), marginal over per-spot effects.
+
+    Args:
+        fit: that is judged.
+        spots: ``[S]`` rows of the capture.
+
+    Returns:
+        ``[S]`` nats.
     """
     index = torch.from_numpy(spots)
     first, last = fit.capture.gate
@@ -67,7 +85,22 @@ def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
 
 
 def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> Comparison:
-    """Paired comparison of log-likelihoods ``[S]`` of the same spots in wall blocks ``block`` ``[S]``."""
+    """Paired comparison of log-likelihoods of the same spots.
+
+    Args:
+        before: ``[S]`` nats.
+        after: ``[S]`` nats.
+        block: ``[S]`` wall block of each spot.
+        seed: of the bootstrap.
+
+    Returns:
+        the gain of ``after`` over ``before``.
+
+    Examples:
+        >>> found = compare(torch.zeros(4), torch.tensor([1.0, 2.0, 1.0, 2.0]), np.array([0, 0, 1, 1]))
+        >>> found.nats, found.error
+        (6.0, 0.0)
+    """
     names, index = np.unique(block, return_inverse=True)
     gain = np.zeros(len(names))
     np.add.at(gain, index, (after - before).numpy())
@@ -78,5 +111,13 @@ def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> 
 
 
 def score(fit: SurfelFit, spots: np.ndarray) -> Scores:
-    """Deviance and NMSE of spots, with their noise levels."""
+    """Deviance and NMSE of spots, with their noise levels.
+
+    Args:
+        fit: that is judged.
+        spots: ``[S]`` rows of the capture.
+
+    Returns:
+        means over the spots' gated bins.
+    """
     return score_spots(fit.model, fit.capture, torch.from_numpy(spots), fit.extension)

@@ -18,10 +18,19 @@ SIDE = 16
 
 
 def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> list[Profile]:
-    """Residuals of ``spots`` ``[S]`` summed over bands of each axis, in standard deviations of their counts.
+    """Residuals summed over bands of each axis, in standard deviations of their counts.
 
     NaN where a band has no spots. The wall's edges are metres in the world frame; depth is left out where
     nothing has one.
+
+    Args:
+        before: the base.
+        after: the extended fit.
+        scan: of the capture.
+        spots: ``[S]`` rows of the capture.
+
+    Returns:
+        one profile an axis: time, depth, scan, rate, wall.
     """
     first, last = scan.gate
     counts = torch.from_numpy(before.capture.counts[spots.numpy(), first:last].astype(np.float32))
@@ -64,7 +73,7 @@ def profiles(before: SurfelFit, after: SurfelFit, scan: Scan, spots: Tensor) -> 
         profile("time", "bin", time_edges, time),
         profile("scan", "spot", order, per_spot(banded(rank, order))),
         profile("rate", "counts/spot", rates, per_spot(banded(total, rates))),
-        Profile("wall", "m", edges[0], *(w.reshape(SIDE, SIDE) for w in wall), edges_y=edges[1]),
+        Profile("wall", "m", edges[0], wall[0].reshape(SIDE, SIDE), wall[1].reshape(SIDE, SIDE), edges[1]),
     ]
     if len(depths) > 1:
         inside = depth.reshape(-1) > 0

@@ -22,8 +22,13 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Gain:
-    """What an effect brings on spots it was not fitted to; ``ci95`` of ``nats_per_photon``, by block
-    bootstrap.
+    """What an effect brings on spots it was not fitted to.
+
+    Args:
+        deviance_per_bin_before: of the control.
+        deviance_per_bin_after: with the effect.
+        nats_per_photon: gained.
+        ci95: of ``nats_per_photon``, by block bootstrap.
     """
 
     deviance_per_bin_before: float

@@ -14,6 +14,7 @@ van der Vaart, *Asymptotic Statistics*, ch. 25.)
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -92,8 +93,19 @@ class Projector:
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
-    """``xᵀx`` ``[P, P]`` with little more than half of its multiplications, which are most of a screening's
-    work.
+    """``xᵀx`` with little more than half of its multiplications, which are most of a screening's work.
+
+    Args:
+        x: ``[N, P]``.
+        block: columns at a time.
+
+    Returns:
+        ``[P, P]``.
+
+    Examples:
+        >>> half_products(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), block=1)
+        tensor([[10., 14.],
+                [14., 20.]])
     """
     gram = x.new_empty(x.shape[1], x.shape[1])
     for start in range(0, x.shape[1], block):
@@ -107,9 +119,15 @@ def screen(problem: Problem, projector: Projector, effects: list[Effect], folds:
     """Test every effect; the largest predicted gain first.
 
     Args:
-        effects: at their nulls. folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block
-            belongs to.
+        problem: of the tested spots.
+        projector: takes off what the base can explain.
+        effects: at their nulls; they stay there.
+        folds: ``[S]`` number of the fold (0 … FOLDS-1) that each spot's wall block belongs to.
+
+    Returns:
+        one candidate an effect, with a copy of it at its best shape.
     """
+    effects = [copy.deepcopy(e) for e in effects]
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
     others = (e for e in effects if not e.per_spot)
     for group in _groups((e, _worthwhile(problem, projector, e)) for e in others):
@@ -126,8 +144,9 @@ def screen(problem: Problem, projector: Projector, effects: list[Effect], folds:
 
 
 def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
-    """Effects whose columns are projected together: a projection passes over all nuisance columns, however
-    few it projects.
+    """Effects whose columns are projected together.
+
+    A projection passes over all nuisance columns, however few it projects.
     """
     group, width = [], 0
     for effect, kept in tried:
@@ -153,12 +172,7 @@ def _score(
     """
     shapes = effect.shape_grid()
     spots, bins = problem.expected.shape
-    lower = torch.cat(
-        [torch.full((p.size,), (p.lower - p.null) / p.scale) for p in effect.amplitudes]
-    ).double()
-    upper = torch.cat(
-        [torch.full((p.size,), (p.upper - p.null) / p.scale) for p in effect.amplitudes]
-    ).double()
+    lower, upper = _bounds(effect)
     prior = effect.precision()[: len(lower)].double()
     scales = PRIOR_SCALES if bool(prior.any()) else (1.0,)
     best: Candidate | None = None
@@ -192,8 +206,19 @@ def _score(
             best = Candidate(
                 effect, statistic, p, retained, gain, step.float(), error.float(), shape, direction, beside
             )
+    assert best is not None  # every effect has a shape, though it be empty
     effect.set_all(best.shape)
     return best
+
+
+def _bounds(effect: Effect) -> tuple[Tensor, Tensor]:
+    """``[k]`` least and largest steps of the stored amplitudes from their nulls."""
+    lower, upper = [], []
+    for p in effect.amplitudes:
+        assert p.null is not None  # what makes an amplitude
+        lower.append(torch.full((p.size,), (p.lower - p.null) / p.scale))
+        upper.append(torch.full((p.size,), (p.upper - p.null) / p.scale))
+    return torch.cat(lower).double(), torch.cat(upper).double()
 
 
 def _predicted(score: Tensor, information: Tensor, ridge: Tensor, lower: Tensor, upper: Tensor) -> float:
@@ -223,9 +248,9 @@ def _worthwhile(
         ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
     ranked.sort(key=lambda entry: -entry[0])
     kept = []
-    for _, shape, z in ranked[:KEPT]:
+    for _, shape, known in ranked[:KEPT]:
         effect.set_all(shape)
-        kept.append((shape, weighted_columns(problem, effect) if z is None else z))
+        kept.append((shape, weighted_columns(problem, effect) if known is None else known))
     return kept
 
 

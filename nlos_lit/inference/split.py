@@ -1,4 +1,4 @@
-"""Which spots are fitted, which select between explanations, and which nothing but the last figure may see."""
+"""Which spots are fitted, which select between explanations, which nothing but the last figure may see."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ STRIDE = 3  # coprime to the number of roles: every row and column of blocks has
 
 @dataclass(frozen=True)
 class Split:
-    """Rows of the capture by role, and the wall block of every spot (``[S]``, contiguous patches)."""
+    """Rows of the capture by role, and the wall block of every spot.
+
+    Args:
+        fit: rows that are fitted.
+        select: rows that select between explanations.
+        test: rows that nothing but the last figure may see.
+        block: ``[S]`` of all spots, contiguous patches.
+    """
 
     fit: np.ndarray
     select: np.ndarray
@@ -25,18 +32,32 @@ class Split:
     block: np.ndarray
 
     def folds(self, spots: Tensor, number: int) -> Tensor:
-        """Fold of each spot: whole blocks, dealt so that neighbours differ."""
+        """Fold of each spot: whole blocks, dealt so that neighbours differ.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            number: of folds.
+
+        Returns:
+            ``[B]`` from 0 to ``number`` - 1.
+        """
         names, index = np.unique(self.block[spots.numpy()], return_inverse=True)
         order = np.random.default_rng(0).permutation(len(names)) % number
         return torch.from_numpy(order[index])
 
 
 def split_spots(capture: Capture, blocks: int = 8) -> Split:
-    """About ``blocks × blocks`` contiguous patches of the wall: five eighths to fit, a quarter to select, an
-    eighth untouched.
+    """Contiguous patches of the wall: five eighths to fit, a quarter to select, an eighth untouched.
 
     Contiguous, because random spots leak through their neighbours. Spots without a single gated count were
     not measured.
+
+    Args:
+        capture: that is split.
+        blocks: patches along each side, about.
+
+    Returns:
+        rows by role.
 
     Raises:
         UserError: a role is left without spots.
@@ -52,6 +73,7 @@ def split_spots(capture: Capture, blocks: int = 8) -> Split:
     for name, spots in parts.items():
         if len(spots) < 8:
             raise UserError(
-                f"only {len(spots)} measured spots are left to {name}; a diagnosis needs a scan of at least 16 × 16 spots"
+                f"only {len(spots)} measured spots are left to {name}; "
+                "a diagnosis needs a scan of at least 16 × 16 spots"
             )
     return Split(**parts, block=place[:, 0] * blocks + place[:, 1])

@@ -17,12 +17,14 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import stats
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.inference.criticise import CriticismSettings, look
 from nlos_lit.inference.screen import Candidate
@@ -36,8 +38,12 @@ Pipeline = Callable[[Capture, Split, int], SurfelFit]
 
 @dataclass(frozen=True)
 class Null:
-    """``moments``: mean and variance of each effect's statistic. ``largest``: largest predicted gain of each
-    toy.
+    """The null distribution of the screening's statistics.
+
+    Args:
+        toys: how many there were.
+        moments: mean and variance of each effect's statistic.
+        largest: largest predicted gain of each toy, nats.
     """
 
     toys: int
@@ -49,10 +55,10 @@ class Null:
         return max(float(candidate.degrees), self.moments.get(candidate.effect.name, (0.0, 0.0))[0])
 
     def p_value(self, candidate: Candidate) -> float:
-        """Of the gamma distribution or of χ², whichever is larger. A toy's statistic is that of its best
-        shape, too.
+        """Of the gamma distribution or of χ², whichever is larger.
 
-        Fewer toys than ``FEW`` do not settle a variance: it is then at least that of a χ² with the same mean.
+        A toy's statistic is that of its best shape, too. Fewer toys than ``FEW`` do not settle a variance: it
+        is then at least that of a χ² with the same mean.
         """
         mean, variance = self.moments.get(candidate.effect.name, (0.0, 0.0))
         if self.toys < FEW:
@@ -66,7 +72,16 @@ class Null:
 
 
 def toy_capture(capture: Capture, fit: SurfelFit, seed: int) -> Capture:
-    """Counts drawn from the fit, inside the gate; zeros before it."""
+    """Counts drawn from the fit, inside the gate; zeros before it.
+
+    Args:
+        capture: whose scan is kept.
+        fit: of all its spots.
+        seed: of the counts.
+
+    Returns:
+        a capture of the same scan.
+    """
     expected = fit.model.expected(torch.arange(capture.n_spots), fit.extension).double().numpy()
     drawn = np.random.default_rng([seed, 77]).poisson(expected)
     counts = np.zeros(capture.counts.shape, dtype=np.uint32)
@@ -83,9 +98,24 @@ def run_toys(
     store: Path,
     report: Report,
 ) -> Null:
-    """``settings.toys`` toys in ``settings.processes`` processes.
+    """Draw toys from the fit and screen each after its own fit, several at a time in other processes.
 
-    Each is kept in ``store`` as it is done, so that interrupted work goes on.
+    Each is kept as it is done, so that interrupted work goes on.
+
+    Args:
+        capture: whose scan is kept.
+        fit: the base, which toys are drawn from.
+        pipeline: that each goes through.
+        split: of the spots.
+        settings: ``toys`` of them in ``processes`` processes.
+        store: folder of their results.
+        report: called with what is done, seconds since the start and seconds left.
+
+    Returns:
+        the null distribution.
+
+    Raises:
+        UserError: a file in ``store`` is damaged or foreign.
     """
     began = time.monotonic()
     store.mkdir(parents=True, exist_ok=True)
@@ -106,11 +136,29 @@ def run_toys(
 
 
 def read_toys(files: list[Path]) -> Null:
-    """The null distribution that stored toys give."""
-    results = [json.loads(file.read_text()) for file in files]
+    """The null distribution that stored toys give.
+
+    Args:
+        files: one a toy.
+
+    Raises:
+        UserError: a file is damaged or foreign.
+    """
+    results = [_read_toy(file) for file in files]
     drawn = {n: np.array([r["statistic"][n] for r in results]) for n in results[0]["statistic"]}
     moments = {n: (float(v.mean()), float(v.var(ddof=1)) if len(v) > 1 else 0.0) for n, v in drawn.items()}
     return Null(len(results), moments, [r["largest"] for r in results])
+
+
+def _read_toy(file: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(file.read_text())
+        return {
+            "statistic": {str(name): float(value) for name, value in found["statistic"].items()},
+            "largest": float(found["largest"]),
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{file} is damaged, or holds no toy: move it away") from error
 
 
 def _toy(

@@ -14,10 +14,16 @@ from nlos_lit.surfels.fit import SurfelFit
 
 @dataclass(frozen=True)
 class Trial:
-    """One rival after its refit: its gain on the select spots over a control that was refitted without it.
+    """One rival after its refit.
 
-    ``predicted``: nats that the screening predicts, cross-validated, for the fitted spots. Both gains are of
-    spots that had no part in the parameters, so that they add up to one piece of evidence.
+    Both gains are of spots that had no part in the parameters, so that they add up to one piece of evidence.
+
+    Args:
+        candidate: as the screening saw it.
+        fit: with the effect.
+        gain: on the select spots, over a control that was refitted without it.
+        likelihood: ``[S]`` of the select spots, nats.
+        predicted: nats that the screening predicts, cross-validated, for the fitted spots.
     """
 
     candidate: Candidate
@@ -45,8 +51,14 @@ def best_of_each(trials: list[Trial]) -> list[Trial]:
 
 
 def choose(trials: list[Trial], block: np.ndarray) -> Trial:
-    """The best rival, or the one with fewest parameters among those that cannot be told from it (one standard
-    error).
+    """The best rival, or a simpler one that cannot be told from it (one standard error).
+
+    Args:
+        trials: the most evidence first.
+        block: ``[S]`` wall block of each select spot.
+
+    Returns:
+        the one with fewest parameters, then the most evidence.
     """
     best = trials[0]
     near = [t for t in trials if t is best or _short(t, best, block, errors=1)]
@@ -54,8 +66,16 @@ def choose(trials: list[Trial], block: np.ndarray) -> Trial:
 
 
 def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float) -> list[str]:
-    """Names that this capture cannot tell from the best: as much evidence, or the same sensitivity and nearly
-    as much.
+    """Names that this capture cannot tell from the best.
+
+    Args:
+        best: the chosen one.
+        trials: all of them.
+        block: ``[S]`` wall block of each select spot.
+        similar: correlation of projected sensitivities from which on two effects are alike.
+
+    Returns:
+        those with as much evidence, or the same sensitivity and nearly as much.
     """
     names = []
     for other in trials:
@@ -68,8 +88,6 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, similar: float
 
 
 def _short(trial: Trial, best: Trial, block: np.ndarray, errors: float) -> bool:
-    """Whether a trial falls short of the best by less than so many errors (of the select spots), or by next
-    to nothing.
-    """
+    """Whether a trial falls short of the best by few errors (of the select spots), or by next to nothing."""
     short = compare(trial.likelihood, best.likelihood, block)
     return short.nats + best.predicted - trial.predicted < max(errors * short.error, 0.02 * best.evidence)

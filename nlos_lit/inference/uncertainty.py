@@ -25,7 +25,10 @@ class Uncertainty:
     which also feels misfit; Huber's sandwich).
 
     Args:
-        spots: ``[S]`` fitted spots that are looked at, with gated ``counts`` and wall ``block``.
+        fit: with the effects.
+        spots: ``[S]`` fitted spots that are looked at.
+        counts: ``[S, T_gate]`` of them.
+        block: ``[S]`` wall block of each.
         share: of all fitted spots that these are: the others have as much to say.
     """
 
@@ -52,12 +55,19 @@ class Uncertainty:
         self.covariance = share * inverse * grow[:, None] * grow[None, :]
 
     def parameters(self, effect: Effect, again: Effect | None = None) -> dict[str, Estimate]:
-        """Reported quantities and their errors. The width of per-spot effects: from the number of spots.
+        """Reported quantities and their errors.
 
         An error is a third of the change over three standard errors along each axis of the covariance, the
         larger of both ways, in quadrature: the delta method where a quantity is linear, and more where it
-        bends, as the length of a vector does whose largest component is not settled. ``again``: the same
-        effect in a fit from new seeds; the difference is an error, too.
+        bends, as the length of a vector does whose largest component is not settled. The width of per-spot
+        effects: from the number of spots.
+
+        Args:
+            effect: one of the fit's.
+            again: the same effect in a fit from new seeds; the difference is an error, too.
+
+        Returns:
+            by name of the quantity.
         """
         if effect.per_spot:
             return _spread(effect, self.fitted)
@@ -94,13 +104,15 @@ def e_size(effect: Effect) -> int:
 
 
 def _spread(effect: Effect, share: float) -> dict[str, Estimate]:
-    """Of a per-spot effect, from the spots that have a number; ``share`` of all spots were fitted. Numbers of
-    spots are for all.
+    """Of a per-spot effect, from the spots that have a number.
+
+    ``share`` of all spots were fitted; numbers of spots are for all.
     """
     known = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
     found = {}
-    for name, (quantity, unit, spots) in effect.quantities().items():
-        value = float(quantity.detach())
-        error = value**0.5 if spots else value / (2 * known) ** 0.5
-        found[name] = Estimate(value / share, error / share, unit) if spots else Estimate(value, error, unit)
+    for name, quantity in effect.quantities().items():
+        value = float(quantity.value.detach())
+        error = value**0.5 if quantity.spots else value / (2 * known) ** 0.5
+        scale = share if quantity.spots else 1.0
+        found[name] = Estimate(value / scale, error / scale, quantity.unit)
     return found

@@ -13,11 +13,22 @@ _BINARY = {"KIB": 2**10, "MIB": 2**20, "GIB": 2**30, "TIB": 2**40}
 _DECIMAL = {"": 1, "B": 1, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _UNITS = _BINARY | _DECIMAL
 # What makes the phasor field smaller.
-SMALLER = "sum spots or bins (scene.sum_spots, scene.sum_bins) or take fewer depth planes (scene.volume.depth_pitch)"
+SMALLER = (
+    "sum spots or bins (scene.sum_spots, scene.sum_bins) or take fewer depth planes "
+    "(scene.volume.depth_pitch)"
+)
 
 
 def parse_bytes(text: str | int | float) -> int:
-    """``"8GiB"``, ``"500 MB"`` or a number of bytes as an integer."""
+    """``"8GiB"``, ``"500 MB"`` or a number of bytes as an integer.
+
+    Raises:
+        UserError: the text is no size.
+
+    Examples:
+        >>> parse_bytes("8GiB"), parse_bytes("500 MB"), parse_bytes(1024)
+        (8589934592, 500000000, 1024)
+    """
     match = re.fullmatch(r"\s*([0-9.]+(?:e[0-9]+)?)\s*([A-Za-z]*)\s*", str(text))
     if not match or match[2].upper() not in _UNITS:
         raise UserError(f"memory_budget must be a size such as 8GiB or 500MB; found {text!r}")
@@ -40,7 +51,8 @@ def check_machine(needed: int, what: str, smaller: str = SMALLER) -> None:
     free = psutil.virtual_memory().available
     if needed > free:
         raise MemoryBudgetError(
-            f"{what} needs about {needed / 2**30:.1f} GiB, this machine has {free / 2**30:.1f} GiB free; {smaller}"
+            f"{what} needs about {needed / 2**30:.1f} GiB, this machine has {free / 2**30:.1f} GiB free; "
+            + smaller
         )
 
 

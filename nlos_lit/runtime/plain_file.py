@@ -70,9 +70,9 @@ def write_plain(
         if id(thing) in names:
             return {"shared": names[id(thing)]}
         if isinstance(thing, (Tensor, np.ndarray)):
-            is_tensor, key = isinstance(thing, Tensor), str(len(arrays))
-            arrays[key] = thing.detach().cpu().numpy() if is_tensor else thing
-            return {"tensor" if is_tensor else "array": key}
+            key = str(len(arrays))
+            arrays[key] = thing if isinstance(thing, np.ndarray) else thing.detach().cpu().numpy()
+            return {"array" if isinstance(thing, np.ndarray) else "tensor": key}
         for kind in kinds:
             if isinstance(thing, kind.of):
                 return {"object": [kind.of.__name__, apart(dict(kind.parts(thing)))]}

@@ -21,8 +21,12 @@ log = logging.getLogger(__name__)
 
 
 class Ticker:
-    """One task's progress; ``update`` may be called as often as one likes, with another total where more is
-    to be done.
+    """One task's progress, a bar on a terminal and lines in a log elsewhere.
+
+    Args:
+        what: is done.
+        total: steps; ``update`` may name another where more is to be done.
+        done: steps that are done already.
     """
 
     def __init__(self, what: str, total: int, done: int = 0) -> None:
@@ -44,6 +48,13 @@ class Ticker:
         self.began = self.spoke = time.monotonic()
 
     def update(self, done: int, note: str = "", total: int | None = None) -> None:
+        """Say how far the task is; it may be called as often as one likes.
+
+        Args:
+            done: steps so far.
+            note: beside them.
+            total: steps in all, where these have changed.
+        """
         self.total = total or self.total
         if self.bar is not None:
             self.bar.update(self.task, completed=done, total=self.total, note=note)
@@ -62,8 +73,12 @@ class Ticker:
 
 
 class StepTicker:
-    """Progress of work whose steps differ and whose length is estimated on the way; as a context it closes
-    its bar.
+    """Progress of work whose steps differ and whose length is estimated on the way.
+
+    As a context it closes its bar.
+
+    Args:
+        what: is done.
     """
 
     def __init__(self, what: str) -> None:
@@ -80,7 +95,13 @@ class StepTicker:
             self.task = self.bar.add_task(what, total=None, note="", left="")
 
     def step(self, text: str, passed: float, left: float) -> None:
-        """What begins now, seconds since the start, seconds left (0: not known)."""
+        """A step begins.
+
+        Args:
+            text: what it is.
+            passed: seconds since the start.
+            left: seconds that are left; 0 where that is not known.
+        """
         ahead = f"about {left:.0f} s left" if left else ""
         if self.bar is not None:
             self.bar.update(

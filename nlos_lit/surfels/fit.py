@@ -1,4 +1,4 @@
-"""The fit of surfels, response and effects to raw counts, by Poisson likelihood on random batches of spots."""
+"""The fit of surfels, response and effects to raw counts: Poisson likelihood on random batches of spots."""
 
 from __future__ import annotations
 
@@ -90,9 +90,14 @@ class SurfelFit:
     """A model on its way to the counts of the training spots.
 
     Args:
+        model: where it begins.
+        capture: that is fitted.
+        grid: surfels stay within its depths.
         counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``.
+        settings: of the fit.
         reserve: places that may grow a surfel, besides those next to surfels.
         extension: effects that are fitted along, in place.
+        generator: draws the batches.
         order: ``[N]`` permutation of the training rows, the first of which are used to test surfels.
     """
 
@@ -115,7 +120,15 @@ class SurfelFit:
         self.tested = order[: settings.test_spots]
 
     def copy(self, extension: Extension, seed: int) -> SurfelFit:
-        """The same fit to go on with other effects, from copies of the surfels."""
+        """The same fit to go on with other effects, from copies of the surfels.
+
+        Args:
+            extension: effects that are fitted along, in place.
+            seed: of the batches.
+
+        Returns:
+            a fit that shares capture, counts and settings with this one.
+        """
         model = copy.deepcopy(self.model)
         generator = torch.Generator().manual_seed(seed)
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
@@ -124,7 +137,7 @@ class SurfelFit:
         )
 
     def parts(self) -> dict[str, Any]:
-        """All that the fit is made of, as :meth:`of_parts` takes it: it goes on from there to the last digit."""
+        """All that the fit is made of, for :meth:`of_parts`, which goes on from there to the last digit."""
         names = ("capture", "grid", "counts", "train", "settings", "reserve", "extension", "order", "place")
         return {name: getattr(self, name) for name in names} | {
             "model": dict(self.model.state_dict()),
@@ -146,8 +159,9 @@ class SurfelFit:
 
     @torch.no_grad()
     def match_energy(self) -> None:
-        """Set the intensity so that rendered light makes up for what the background does not count, through
-        all effects.
+        """Set the intensity so that rendered light makes up for what the background does not count.
+
+        Through all effects.
         """
         sensor, spots, counted = (
             self.model.laser_sensor,
@@ -178,11 +192,17 @@ class SurfelFit:
         steps: int | None = None,
         settle: bool = True,
     ) -> list[dict[str, float]]:
-        """``rounds`` rounds of ``steps`` batches (None: as set), the last twice as long; surfels die and grow
-        between.
+        """Several rounds, the last twice as long; surfels die and grow between.
 
-        ``settle``: the first round comes from seeds, and the response waits for their places.
-        Returns one entry a round: surfels, mean loss over its last quarter, response.
+        Args:
+            rounds: how many.
+            progress: called with (batches done, of how many).
+            grow_first: surfels die and grow before the first round, too.
+            steps: batches a round; None takes those of the settings.
+            settle: the first round comes from seeds, and the response waits for their places.
+
+        Returns:
+            one entry a round: surfels, mean loss over its last quarter, response.
         """
         s, history, begun = self.settings, [], self.done
         steps = steps or s.steps
@@ -215,12 +235,16 @@ class SurfelFit:
         return history
 
     def converge(self, progress: Progress | None = None) -> list[dict[str, float]]:
-        """Last rounds anew, ``more`` at most, while the fit is above the noise and a round gains more than
-        ``WORTH`` a parameter.
+        """Last rounds anew, while the fit is above the noise and gains more than ``WORTH`` a parameter.
 
         Bright captures take longer to converge; where the fit is at the noise already, more batches would
-        only fit the noise. Returns one entry a round; ``progress`` goes on from the batches that were done
-        before.
+        only fit the noise.
+
+        Args:
+            progress: goes on from the batches that were done before.
+
+        Returns:
+            one entry a round, ``more`` at most.
         """
 
         def told(done: int, total: int) -> None:

@@ -62,16 +62,19 @@ class Score(NamedTuple):
 def volume_maxima(
     intensity: Tensor, grid: VolumeGrid, floor: float, per_cell: int, lateral: Lateral
 ) -> tuple[Seeds, Tensor]:
-    """Local maxima along z of at least ``floor`` × the volume's maximum, the ``per_cell`` largest of each
-    lateral cell.
+    """The largest local maxima along z of each lateral cell.
 
     Their depths are interpolated between voxels by a parabola.
 
     Args:
+        intensity: ``[nz, nx, ny]`` on ``grid``.
+        grid: of the image.
+        floor: share of the volume's maximum that they reach at least.
+        per_cell: of them in each lateral cell of the grid.
         lateral: cells of the surfels; a maximum seeds every cell of its voxel.
 
     Returns:
-        candidates and their intensities relative to the maximum.
+        places, and ``[V]`` their intensities relative to the maximum.
     """
     volume = intensity.detach() / intensity.max()
     padded = torch.nn.functional.pad(volume, (0, 0, 0, 0, 1, 1), value=-1.0)
@@ -97,7 +100,15 @@ def volume_maxima(
 
 
 def cell_centres(index: Tensor, lateral: Lateral) -> Tensor:
-    """``[N, 2]`` centres, m, of lateral cells ``[N, 2]``."""
+    """Centres of lateral cells.
+
+    Args:
+        index: ``[N, 2]`` of the cells.
+        lateral: their lattice.
+
+    Returns:
+        ``[N, 2]`` m.
+    """
     origin, pitch = (
         torch.tensor(v, dtype=torch.float32, device=index.device) for v in (lateral.origin, lateral.pitch)
     )
@@ -105,8 +116,9 @@ def cell_centres(index: Tensor, lateral: Lateral) -> Tensor:
 
 
 def rank_one(counts: Tensor) -> Tensor:
-    """``[S, T]`` expectation without structure: each spot's total times the mean transient (smoothed by a
-    hair of background).
+    """Expectation without structure: each spot's total times the mean transient, ``[S, T]`` of ``[S, T]``.
+
+    The mean is smoothed by a hair of background.
     """
     total = counts.sum(1, keepdim=True).double()
     mean = counts.double().sum(0) + 0.5
@@ -114,7 +126,16 @@ def rank_one(counts: Tensor) -> Tensor:
 
 
 def start_response(capture: Capture, counts: Tensor, start: LaserSensor | None) -> LaserSensor:
-    """Start values and bounds of the response, from training ``counts`` ``[N, T_gate]`` alone."""
+    """Start values and bounds of the response, from training counts alone.
+
+    Args:
+        capture: for its bins.
+        counts: ``[N, T_gate]`` of the training spots.
+        start: whose width and decay are taken; None takes 1.2 bins and 0.7 per bin.
+
+    Returns:
+        the response, of unit intensity.
+    """
     length = capture.bin_length
     smallest = math.sqrt(SPLINE_VARIANCE + 0.05**2) * length
     sigma = max(1.2 * length if start is None else float(start.sigma_ls().detach()), 1.05 * smallest)
@@ -147,12 +168,21 @@ def score(
     spots: Tensor,
     hooks: Hooks = NOTHING,
 ) -> Score:
-    """Test candidates on ``spots``.
+    """Test places of surfels against the present expectation.
 
     Args:
-        cell: extents of a cell, m. points: quadrature points along each side.
-        counts, expected: ``[B, T_gate]`` of ``spots`` ``[B]``.
-        hooks: whose response is applied.
+        candidates: V places.
+        capture: for its wall points and bins.
+        cell: extents of a cell, m.
+        points: quadrature points along each side.
+        laser_sensor: present response.
+        counts: ``[B, T_gate]`` of the spots.
+        expected: ``[B, T_gate]`` of the spots.
+        spots: ``[B]`` rows of the capture that are looked at.
+        hooks: effects, whose response is applied.
+
+    Returns:
+        score and information of each place's albedo.
     """
     sensor, bins = laser_sensor, capture.gate[1]
     device = counts.device
@@ -171,10 +201,12 @@ def score(
     whole = hooks.response(whole, sensor.lead)
     pull = adjoint(counts / expected - 1, kernel)
     weight = adjoint(1 / expected, whole**2).clamp_min(0)
-    walls = [
-        torch.tensor(getattr(capture, n)[spots.cpu().numpy()], dtype=torch.float32, device=device)
-        for n in ("laser", "laser_normal", "sensor", "sensor_normal")
-    ]
+    rows = spots.cpu().numpy()
+    laser, laser_normal, sensor_point, sensor_normal = (
+        torch.tensor(points[rows], dtype=torch.float32, device=device)
+        for points in (capture.laser, capture.laser_normal, capture.sensor, capture.sensor_normal)
+    )
+    walls = (laser, laser_normal, sensor_point, sensor_normal)
     offsets = quadrature(points, device)
     extent = torch.tensor(cell, device=device).abs()
     n = len(candidates.centre)
@@ -199,7 +231,16 @@ def score(
 
 
 def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Seeds:
-    """The eight places around each surfel to which its plane extends."""
+    """The eight places around each surfel to which its plane extends.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit.
+        cell: ``[2]`` extents of a cell, m.
+
+    Returns:
+        8 M places with the normals of their surfels.
+    """
     moves = torch.tensor(
         [(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if i or j], device=centre.device
     )
@@ -216,7 +257,21 @@ def facings(places: Seeds) -> Seeds:
 
 
 def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096) -> Tensor:
-    """``[V]`` True where a surfel lies within ``reach`` (m) of the candidate."""
+    """Which places have a surfel nearby.
+
+    Args:
+        candidates: ``[V, 3]`` m.
+        centre: ``[M, 3]`` m, of the surfels.
+        reach: m.
+        chunk: places at a time.
+
+    Returns:
+        ``[V]`` True where a surfel lies within reach.
+
+    Examples:
+        >>> occupied(torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0]]), torch.tensor([[0.0, 0.1, 1.0]]), 0.2)
+        tensor([ True, False])
+    """
     if len(centre) == 0 or len(candidates) == 0:
         return torch.zeros(len(candidates), dtype=torch.bool, device=candidates.device)
     near = [torch.cdist(p, centre, compute_mode=EXACT).min(1).values < reach for p in candidates.split(chunk)]
@@ -224,7 +279,21 @@ def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096
 
 
 def best_apart(centre: Tensor, value: Tensor, reach: float) -> Tensor:
-    """Indices of the candidates that have no better one within ``reach`` (m), best first."""
+    """The places that have no better one nearby.
+
+    Args:
+        centre: ``[V, 3]`` m.
+        value: ``[V]`` how good they are.
+        reach: m within which only the best stays.
+
+    Returns:
+        indices, best first.
+
+    Examples:
+        >>> centre = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.1, 1.0], [0.5, 0.0, 1.0]])
+        >>> best_apart(centre, torch.tensor([1.0, 3.0, 2.0]), reach=0.2)
+        tensor([1, 2])
+    """
     order = torch.argsort(value, descending=True, stable=True)
     points = centre[order].cpu().double().numpy()
     near = cKDTree(points).query_ball_point(points, reach) if len(points) else []
@@ -261,24 +330,31 @@ def prune_and_grow(
     grow: float,
     hooks: Hooks = NOTHING,
 ) -> None:
-    """Drop surfels that the counts do not need or that left the volume; add some where the counts ask for
-    more light.
+    """Drop surfels that the counts do not need or that left the volume; add some where light is missing.
 
     Args:
+        model: whose surfels are replaced.
+        capture: that is fitted.
+        grid: whose depths bound the volume.
         reserve: unused seeds; candidates besides the places next to surfels.
-        counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; ``tested`` are the rows that are
-            looked at.
-        prune, grow: significances, over all training spots.
+        counts: ``[N, T_gate]`` of the training spots.
+        train: ``[N]`` their rows of the capture.
+        tested: rows of ``counts`` that are looked at.
+        prune: significance below which a surfel dies, over all training spots.
+        grow: significance from which on a place gets one, over all training spots.
         hooks: effects of the present expectation; candidates are tested with their response.
+
+    Raises:
+        UserError: no surfel is left.
     """
     spots, seen = train[tested], counts[tested]
     expected = model.expected(spots, hooks)
     scale = len(train) / len(tested)
     low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
-    sensor, cell = model.laser_sensor, tuple(model.cell.tolist())
+    sensor, (across, along) = model.laser_sensor, model.cell.tolist()
 
     def test(places: Seeds, points: int) -> Score:
-        return score(places, capture, cell, points, sensor, seen, expected, spots, hooks)
+        return score(places, capture, (across, along), points, sensor, seen, expected, spots, hooks)
 
     present = Seeds(model.centre(), model.normal())
     albedo = model.albedo()
@@ -286,7 +362,8 @@ def prune_and_grow(
     needed &= (present.centre[:, 2] > low) & (present.centre[:, 2] < high)
     if not needed.any():
         raise UserError(
-            "every surfel faded away during refinement: the counts hold no third-bounce light at the image's maxima"
+            "every surfel faded away during refinement: the counts hold no third-bounce light at the image's "
+            "maxima"
         )
     kept, albedo = present.take(needed), albedo[needed]
     places = Seeds(

@@ -35,13 +35,29 @@ class SurfelModel(nn.Module):
 
     Args:
         capture: for its wall points and time axis; its counts are not kept.
-        centre: ``[M, 3]`` m. normal: ``[M, 3]`` towards the wall's side. albedo: ``[M]`` > 0.
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` towards the wall's side.
+        albedo: ``[M]`` > 0.
         lateral: cells of the surfels.
         laser_sensor: from :func:`spline_sensor`.
         quadrature: points along each side of a surfel.
+
+    Attributes:
+        anchor: ``[M, 3]`` m, centres at depth 0.
+        direction: ``[M, 3]`` unit.
+        visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
+        pairs: neighbours on one sheet, see :meth:`link`.
     """
 
+    laser: Tensor
+    laser_normal: Tensor
+    sensor: Tensor
+    sensor_normal: Tensor
+    cell: Tensor
+    anchor: Tensor
+    direction: Tensor
     visible: Tensor
+    pairs: tuple[Tensor, Tensor]
 
     def __init__(
         self,
@@ -67,7 +83,13 @@ class SurfelModel(nn.Module):
         self.place(centre, normal, albedo)
 
     def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
-        """Replace all surfels; they see every spot until :meth:`update_visibility`."""
+        """Replace all surfels; they see every spot until :meth:`update_visibility`.
+
+        Args:
+            centre: ``[M, 3]`` m.
+            normal: ``[M, 3]`` of any length, towards the wall's side.
+            albedo: ``[M]`` > 0.
+        """
         device = self.laser.device
         normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
         steep = -normal[:, 2:] < STEEP
@@ -112,13 +134,14 @@ class SurfelModel(nn.Module):
         self.pairs = neighbour_pairs(self.centre(), normal, 1.6 * self.cell.max() * stretch)
 
     def bending(self) -> Tensor:
-        """How badly normals and places of neighbours fit one surface, in squared radians summed over pairs."""
+        """How badly neighbours fit one surface, in squared radians summed over pairs."""
         albedo = self.albedo().detach()
         return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
 
     def presence(self) -> Tensor:
-        """How many surfels there are, each counted as a/(a + ε) with ε a tenth of the mean albedo a: the weak
-        ones feel it most.
+        """How many surfels there are, each counted as a/(a + ε).
+
+        ε is a tenth of the mean albedo a: the weak ones feel it most.
         """
         albedo = self.albedo()
         return (albedo / (albedo + 0.1 * albedo.detach().mean())).sum()
@@ -128,8 +151,8 @@ class SurfelModel(nn.Module):
         """Find from which wall points each surfel's centre is hidden by the front sheet of the others.
 
         Args:
-            opaque: surfels of at least this share of the mean albedo hide. skip: cells before the surfel that
-                do not.
+            opaque: surfels of at least this share of the mean albedo hide.
+            skip: cells before the surfel that do not.
             samples: along each line of sight.
         """
         albedo, centre = self.albedo(), self.centre()
@@ -163,7 +186,16 @@ class SurfelModel(nn.Module):
         return (length - self.t_start) / self.bin_length
 
     def transients(self, paths: Paths, spots: Tensor, hooks: Hooks) -> Tensor:
-        """Stages 2 and 3: ``[B, T]`` light on arrival, H_r."""
+        """Stages 2 and 3: light on arrival, H_r.
+
+        Args:
+            paths: of the spots, for unit albedo.
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act on paths, times and transients.
+
+        Returns:
+            ``[B, T]`` from the capture's bin 0 to the gate's end.
+        """
         energy, length = (
             hooks.path(paths.contribution * self.albedo()[:, None], paths, spots),
             hooks.time(paths.length, paths, spots),
@@ -172,23 +204,57 @@ class SurfelModel(nn.Module):
         return hooks.transients(transients, energy, paths, spots)
 
     def signal(self, transients: Tensor, hooks: Hooks) -> Tensor:
-        """Stage 4: ``[B, T]`` transients through the response, counts."""
+        """Stage 4: transients through the response.
+
+        Args:
+            transients: ``[B, T]`` light on arrival.
+            hooks: effects that act on the response.
+
+        Returns:
+            ``[B, T]`` counts.
+        """
         sensor = self.laser_sensor
         return sensor.intensity() * convolve_time(
             transients, hooks.response(sensor.kernel(), sensor.lead), sensor.lead
         )
 
     def detect(self, signal: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
-        """Stage 5: ``[B, T]`` expected counts: gain → background → counting."""
+        """Stage 5: gain, background and counting.
+
+        Args:
+            signal: ``[B, T]`` counts of the light.
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act on them.
+
+        Returns:
+            ``[B, T]`` expected counts.
+        """
         background = hooks.background(self.laser_sensor.background(), spots)
         return hooks.counting(hooks.gain(signal, spots) + background, spots)
 
     def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
-        """Stages 4 and 5."""
+        """Stages 4 and 5.
+
+        Args:
+            transients: ``[B, T]`` light on arrival.
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act there.
+
+        Returns:
+            ``[B, T]`` expected counts.
+        """
         return self.detect(self.signal(transients, hooks), spots, hooks)
 
     def render(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
-        """``[B, T_gate]`` expected counts of ``spots`` ``[B]``."""
+        """All stages.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects.
+
+        Returns:
+            ``[B, T_gate]`` expected counts.
+        """
         transients = self.transients(self.paths(spots), spots, hooks)
         return self.record(transients, spots, hooks)[:, self.gate[0] :]
 
@@ -196,12 +262,28 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def expected(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
-        """:meth:`render` without gradients, in batches of about two million paths."""
+        """:meth:`render` without gradients, in batches of about two million paths.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects.
+
+        Returns:
+            ``[B, T_gate]`` expected counts.
+        """
         return torch.cat([self.render(part, hooks) for part in self._batches(spots)])
 
     @torch.no_grad()
     def light(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
-        """``[B, T_gate]`` counts of the light by itself, before background and counting effects."""
+        """The light by itself, before background and counting effects.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects.
+
+        Returns:
+            ``[B, T_gate]`` counts.
+        """
         parts = self._batches(spots)
         signals = [hooks.gain(self.signal(self.transients(self.paths(p), p, hooks), hooks), p) for p in parts]
         return torch.cat(signals)[:, self.gate[0] :]
@@ -223,7 +305,15 @@ class SurfelModel(nn.Module):
 
     @classmethod
     def from_state(cls, capture: Capture, state: dict[str, Any]) -> SurfelModel:
-        """The model whose ``state_dict()`` this is, over the same capture."""
+        """The model whose ``state_dict()`` this is.
+
+        Args:
+            capture: of the model.
+            state: with ``_extra_state``.
+
+        Returns:
+            a model with as many surfels, neighbours linked anew.
+        """
         extra = state["_extra_state"]
         middle = {
             name: (math.sqrt(low * high), low, high, unit)
@@ -251,8 +341,22 @@ def spline_sensor(capture: Capture, parameters: dict[str, BoundedParameter]) -> 
     """A laser-sensor model for transients splatted by cubic B-splines, whose width it takes out of Ψ.
 
     σ_ls cannot be below √(1/3 + 0.05²) = 0.58 bins.
+
+    Args:
+        capture: for its bins.
+        parameters: ``sigma_ls``, ``kappa_s``, ``intensity``, ``background``.
+
+    Returns:
+        the response, from the capture's bin 0 to the gate's end.
     """
-    sensor = LaserSensor(bin_length=capture.bin_length, n_bins=capture.gate[1], **parameters)
+    sensor = LaserSensor(
+        bin_length=capture.bin_length,
+        n_bins=capture.gate[1],
+        sigma_ls=parameters["sigma_ls"],
+        kappa_s=parameters["kappa_s"],
+        intensity=parameters["intensity"],
+        background=parameters["background"],
+    )
     sensor.splat_variance = SPLINE_VARIANCE
     return sensor
 

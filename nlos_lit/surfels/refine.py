@@ -70,20 +70,24 @@ def refine(
     heldout_spots: np.ndarray | None = None,
     scan_shapes: bool = False,
 ) -> Refined:
-    """Fit surfels and response to the counts of ``train_spots``; the counts of ``heldout_spots`` are only
-    scored at the end.
+    """Fit surfels and response to the counts of the training spots.
 
     Args:
         capture: raw counts and scan.
         intensity: ``[nz, nx, ny]`` phasor image on ``grid``.
+        grid: of the image.
+        settings: of the fit.
         train_spots: ``[N]`` rows of the capture.
         laser_sensor_start: start values of the response; None takes 1.2 bins and 0.7 per bin.
         extension: physical effects fitted along with the surfels, in place.
         progress: called with (steps done, of how many).
         seed: of batches and tested spots.
-        heldout_spots: ``[N']`` rows to score; None scores nothing.
+        heldout_spots: ``[N']`` rows whose counts are only scored at the end; None scores nothing.
         scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
             them, instead of where they are; costs one round more.
+
+    Returns:
+        the fitted model, scores and history.
 
     Raises:
         UserError: shapes disagree, or no place of the image is significant in the counts.
@@ -92,7 +96,8 @@ def refine(
     began = time.perf_counter()
     if tuple(intensity.shape) != tuple(grid.shape):
         raise UserError(
-            f"the image has shape {tuple(intensity.shape)}, its grid {tuple(grid.shape)}; give the grid it was imaged on"
+            f"the image has shape {tuple(intensity.shape)}, its grid {tuple(grid.shape)}; "
+            "give the grid it was imaged on"
         )
     train = torch.as_tensor(np.asarray(train_spots), dtype=torch.long)
     extension = Extension([]) if extension is None else extension
@@ -108,8 +113,8 @@ def refine(
     normalise_albedo(model)
     held = torch.as_tensor(np.asarray([] if heldout_spots is None else heldout_spots), dtype=torch.long)
     scores = score_spots(model, capture, held, extension) if len(held) else None
-    sensor = model.laser_sensor
-    parameters = {name: (p().item(), p.unit) for name, p in sensor.named_children()}
+    response = model.laser_sensor.named_children()
+    parameters = {name: (p().item(), p.unit) for name, p in response if isinstance(p, BoundedParameter)}
     return Refined(model, extension, fit, scores, parameters, history, time.perf_counter() - began)
 
 
@@ -166,9 +171,9 @@ def _seeded(
     widest, bins = max(abs(p) for p in grid.pitch[:2]), capture.bin_length
     subdivide = s.subdivide or (2 if widest > 6 * bins else 1)
     points = s.quadrature or int(np.clip(math.ceil(widest / subdivide * 0.55 / bins), 1, 8))
-    pitch = tuple(p / subdivide for p in grid.pitch[:2])
-    origin = tuple(o - (subdivide - 1) / 2 * p for o, p in zip(grid.origin[:2], pitch, strict=True))
-    lateral = Lateral(origin, pitch, (grid.shape[1] * subdivide, grid.shape[2] * subdivide))
+    dx, dy = (p / subdivide for p in grid.pitch[:2])
+    x, y = (o - (subdivide - 1) / 2 * p for o, p in zip(grid.origin[:2], (dx, dy), strict=True))
+    lateral = Lateral((x, y), (dx, dy), (grid.shape[1] * subdivide, grid.shape[2] * subdivide))
     sensor = start_response(capture, counts, start)
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(train), generator=generator)
@@ -182,8 +187,9 @@ def _seeded(
         keep &= significance >= significance.topk(s.max_seeds).values[-1]
     if not keep.any():
         raise UserError(
-            f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold only noise, or "
-            "scene.volume.depth or the gate misses the hidden scene (surfels.significance sets the level)"
+            f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold "
+            "only noise, or scene.volume.depth or the gate misses the hidden scene "
+            "(surfels.significance sets the level)"
         )
     best = significance.topk(min(s.max_seeds, len(significance))).indices
     seeds = candidates.take(keep)
@@ -191,9 +197,14 @@ def _seeded(
     smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
     check_machine(step_bytes + 8 * counts.numel(), "one refinement step", smaller)
     model = SurfelModel(
-        capture, centre=seeds.centre, normal=seeds.normal, albedo=value[keep] / value[keep].mean(), lateral=lateral,
-        laser_sensor=sensor, quadrature=points,
-    )  # fmt: skip
+        capture,
+        centre=seeds.centre,
+        normal=seeds.normal,
+        albedo=value[keep] / value[keep].mean(),
+        lateral=lateral,
+        laser_sensor=sensor,
+        quadrature=points,
+    )
     fit = SurfelFit(
         model, capture, grid, counts, train, s, candidates.take(best), extension, generator, order
     )
