@@ -84,8 +84,9 @@ def work(name: str, spec: object) -> str:
     said = ", ".join(outcome.named) or "-"
     errors = {n: [round(v, 2) for v in e] for es in outcome.errors.values() for n, e in es.items()}
     return (
-        f"{name} {spec.scene} {spec.level:g} | {hidden} {strengths} (TS {outcome.statistic:.0f}) -> {said} {outcome.groups} "
-        f"unexplained {outcome.unexplained or '-'} gain {outcome.gain:.0f}/{outcome.oracle:.0f} {errors} base {outcome.ratio:.3f} "
+        f"{name} {spec.scene} {spec.level:g} | {hidden} {strengths} (TS {outcome.statistic:.0f}) "
+        f"-> {said} {outcome.groups} unexplained {outcome.unexplained or '-'} "
+        f"gain {outcome.gain:.0f}/{outcome.oracle:.0f} {errors} base {outcome.ratio:.3f} "
         f"{outcome.seconds:.0f} s"
     )
 

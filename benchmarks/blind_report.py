@@ -210,7 +210,10 @@ def tables(store: Path) -> str:
         ranked = sorted(said.items(), key=lambda pair: -pair[1])
         out.append(f"| {hidden} | {', '.join(f'{n} ({k})' for n, k in ranked)} |")
     out += ["", "## Every capture", ""]
-    heads = "scene | counts | hidden | true statistic | said | unexplained | nats / oracle's | parameter errors | base / noise | s"
+    heads = (
+        "scene | counts | hidden | true statistic | said | unexplained | nats / oracle's | "
+        "parameter errors | base / noise | s"
+    )
     out += [f"| {heads} |"]
     out += ["|---" * 10 + "|"]
     out += [line(case, "" if name in now else " †") for name, case in named.items()]

@@ -86,10 +86,14 @@ def measure(workload: Workload, device: torch.device) -> dict[str, object]:
     total = time.perf_counter() - began
     memory = torch.cuda.max_memory_allocated(device) if device.type == "cuda" else peak_bytes()
     return {
-        "name": workload.name, "volume": list(training.pipeline.phasor.grid.shape), "precision": str(training.plan.precision),
-        "setup_s": setup, "iterations": workload.iterations, "iteration_s": (total - setup) / workload.iterations, "total_s": total,
-        "product_bytes_per_s": product_bandwidth(training), "copy_bytes_per_s": copy_bandwidth(device), "memory_bytes": memory,
-        "waits": len(waited), "first_wait": waited[0] if waited else None, "rays_lost": lost, "paper_hours": workload.paper_hours,
+        "name": workload.name, "volume": list(training.pipeline.phasor.grid.shape),
+        "precision": str(training.plan.precision),
+        "setup_s": setup, "iterations": workload.iterations,
+        "iteration_s": (total - setup) / workload.iterations, "total_s": total,
+        "product_bytes_per_s": product_bandwidth(training), "copy_bytes_per_s": copy_bandwidth(device),
+        "memory_bytes": memory,
+        "waits": len(waited), "first_wait": waited[0] if waited else None, "rays_lost": lost,
+        "paper_hours": workload.paper_hours,
         "machine": machine(),
     }  # fmt: skip
 
@@ -125,8 +129,10 @@ def main(arguments: list[str]) -> None:
             head,
             [
                 [
-                    r["name"], f"{r['setup_s']:.2f} s", f"{1e3 * r['iteration_s']:.2f} ms", f"{r['total_s']:.1f} s",
-                    f"{r['paper_hours']} h", f"{r['product_bytes_per_s'] / 1e9:.0f} / {r['copy_bytes_per_s'] / 1e9:.0f} GB/s",
+                    r["name"], f"{r['setup_s']:.2f} s", f"{1e3 * r['iteration_s']:.2f} ms",
+                    f"{r['total_s']:.1f} s",
+                    f"{r['paper_hours']} h",
+                    f"{r['product_bytes_per_s'] / 1e9:.0f} / {r['copy_bytes_per_s'] / 1e9:.0f} GB/s",
                     f"{r['memory_bytes'] / GIB:.1f} GiB", str(r["waits"]),
                 ]
                 for r in rows

@@ -201,7 +201,7 @@ class LiteralIteration:
 
 
 def _neighbour(point: Tensor, hit: Tensor, di: int, dj: int) -> tuple[Tensor, Tensor]:
-    """Points of the rays one cell further on; the ray's own point where that one met nothing or lies outside."""
+    """Points of the rays one cell further on; the ray's own where that one met nothing or lies outside."""
     there = torch.roll(hit, (-di, -dj), (1, 2))
     if di:
         there[:, -1 if di > 0 else 0] = False

@@ -54,7 +54,8 @@ def evaluate(
     )
     named = {
         "omega_pf": phasor.omega_pf.raw, "sigma_pf": phasor.sigma_pf.raw, "sigma_ls": sensor.sigma_ls.raw,
-        "kappa_s": sensor.kappa_s.raw, "I_l": sensor.intensity.raw, "eta_s": sensor.background.raw, "albedo": albedo.raw,
+        "kappa_s": sensor.kappa_s.raw, "I_l": sensor.intensity.raw, "eta_s": sensor.background.raw,
+        "albedo": albedo.raw,
     }  # fmt: skip
     terms = iteration.terms(spots, counts.to(albedo.raw.dtype))
     gradients = torch.autograd.grad(terms["transient"], list(named.values()))
@@ -99,10 +100,14 @@ def compare(workload: Workload, repeats: int) -> dict[str, object]:
     hits = len(paper.pipeline(paper.batch()[0]).surface.spot)
     found = {name: median(values) for name, values in times.items()}
     return {
-        "name": workload.name, "spots": capture.n_spots, "bins": workload.bins, "voxels": paper.pipeline.phasor.grid.n_voxels,
-        "planes": workload.planes, "batch": workload.batch, "rays": workload.rays**2, "frequencies": len(literal.omega),
-        "rank": paper.plan.rank, "ffts": literal.ffts, "samples": workload.batch * workload.rays**2 * literal.n_samples,
-        "setup_s": setup, "ours_s": found["ours"], "default_s": found["default"], "literal_s": found["literal"],
+        "name": workload.name, "spots": capture.n_spots, "bins": workload.bins,
+        "voxels": paper.pipeline.phasor.grid.n_voxels,
+        "planes": workload.planes, "batch": workload.batch, "rays": workload.rays**2,
+        "frequencies": len(literal.omega),
+        "rank": paper.plan.rank, "ffts": literal.ffts,
+        "samples": workload.batch * workload.rays**2 * literal.n_samples,
+        "setup_s": setup, "ours_s": found["ours"], "default_s": found["default"],
+        "literal_s": found["literal"],
         "ratio": found["literal"] / found["ours"], "ratio_default": found["literal"] / found["default"],
         "hits": hits, "repeats": repeats, "machine": machine(),
     }  # fmt: skip
@@ -143,12 +148,13 @@ def report() -> None:
     for r in (row for w in SIZES if (row := stored("ratio", w.name))):
         rows.append([
             r["name"], f"{r['spots']} × {r['bins']} → {r['voxels']}", f"{r['batch']} × {r['rays']}",
-            f"{r['ffts']}, {r['samples'] / 1e6:.3g} M", f"{r['literal_s']:.3g} s", f"{1e3 * r['ours_s']:.3g} ms",
+            f"{r['ffts']}, {r['samples'] / 1e6:.3g} M", f"{r['literal_s']:.3g} s",
+            f"{1e3 * r['ours_s']:.3g} ms",
             f"{r['ratio']:.0f}",
             f"{1e3 * r['default_s']:.3g} ms", f"{r['ratio_default']:.0f}",
         ])  # fmt: skip
-    head = ["size", "scan × bins → voxels", "spots × rays", "literal: FFTs, samples", "literal", "ours, model=paper", "ratio",
-            "ours, model=default", "ratio"]  # fmt: skip
+    head = ["size", "scan × bins → voxels", "spots × rays", "literal: FFTs, samples", "literal",
+            "ours, model=paper", "ratio", "ours, model=default", "ratio"]  # fmt: skip
     text = table(head, rows)
     rows = []
     for r in (row for w in SIZES if (row := stored("accuracy", w.name))):

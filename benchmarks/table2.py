@@ -60,8 +60,10 @@ def measure(workload: Workload, allowed_s: float, device: str = "cpu") -> dict[s
     return {
         "name": workload.name, "spots": list(workload.spots), "bins": workload.bins,
         "volume": list(training.pipeline.phasor.grid.shape),
-        "frequencies": training.plan.n_frequencies, "rank": training.plan.rank, "precision": str(training.plan.precision),
-        "setup_s": setup, "iteration_s": iteration, "iterations": workload.iterations, "measured_iterations": len(times),
+        "frequencies": training.plan.n_frequencies, "rank": training.plan.rank,
+        "precision": str(training.plan.precision),
+        "setup_s": setup, "iteration_s": iteration, "iterations": workload.iterations,
+        "measured_iterations": len(times),
         "complete": complete, "setup_cpu_s": setup_cpu, "iteration_cpu_s": iteration_cpu,
         "total_s": setup + (sum(times) if complete else iteration * workload.iterations),
         "estimate_bytes": estimate, "peak_bytes": peak, "hits": hits, "loss": [losses[0], losses[-1]],
@@ -112,8 +114,9 @@ def report() -> None:
             f"{60 * workload.paper_hours:.0f} min", f"{3600 * workload.paper_hours / core:.0f}",
             f"{r['estimate_bytes'] / GIB:.2f} / {r['peak_bytes'] / GIB:.2f} GiB", f"{100 * r['hits']:.1f} %",
         ])  # fmt: skip
-    head = ["scene", "scan × bins → volume", "set-up", "iteration", "iterations", "total", "on the wall's clock", "iterations run",
-            "paper, A100", "paper / total", "memory: estimated / measured", "rays that meet a surface"]  # fmt: skip
+    head = ["scene", "scan × bins → volume", "set-up", "iteration", "iterations", "total",
+            "on the wall's clock", "iterations run", "paper, A100", "paper / total",
+            "memory: estimated / measured", "rays that meet a surface"]  # fmt: skip
     figure = "![time of all iterations](images/table2.png)"
     write_section("table2", table(head, rows) + ("\n\n" + figure if minutes else ""))
     if minutes:

@@ -1,6 +1,6 @@
-"""Workloads for the speed benchmarks: captures of given sizes, and the training iteration that train.py runs.
-Only torch and numpy.
+"""Workloads for the speed benchmarks: captures of given sizes, and the training iteration of train.py.
 
+Only torch and numpy.
 The captures are cheap sums over the points of a surface (a dome in front of a tilted plate) with Poisson
 noise: sizes, occupied volume and rays that meet something are those of real scenes, and that is what an
 iteration's time depends on.
@@ -21,14 +21,14 @@ from torch import Tensor
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from nlos_lit.capture import Capture
-from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.model.build import PipelineSettings, build_pipeline, match_energy, normalisation
-from nlos_lit.model.objective import Objective, rated_groups
-from nlos_lit.model.phasor import PhasorPlan
-from nlos_lit.model.pipeline import Pipeline
+from nlos_lit.capture import Capture  # noqa: E402
+from nlos_lit.capture.volume_grid import volume_grid  # noqa: E402
+from nlos_lit.model.build import PipelineSettings, build_pipeline, match_energy, normalisation  # noqa: E402
+from nlos_lit.model.objective import Objective, rated_groups  # noqa: E402
+from nlos_lit.model.phasor import PhasorPlan  # noqa: E402
+from nlos_lit.model.pipeline import Pipeline  # noqa: E402
 
-RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}  # conf/model/default.yaml
+RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}  # conf/optimizer/adam.yaml
 LAMBDA_ALBEDO = 5e-3
 PROFILES = {
     # conf/model: (settings beyond PipelineSettings' defaults, λ1)
@@ -100,7 +100,8 @@ def _chen(name: str, depth: float, planes: int, iterations: int, hours: float) -
 
 def _liu(name: str, iterations: int, hours: float) -> Workload:
     return Workload(
-        name, (130, 180), 4096, 0.01, 0.0012, 0.5, 417, 0.0048, confocal=False, lateral=(180, 180), iterations=iterations,
+        name, (130, 180), 4096, 0.01, 0.0012, 0.5, 417, 0.0048, confocal=False, lateral=(180, 180),
+        iterations=iterations,
         paper_hours=hours,
     )  # fmt: skip
 
@@ -174,9 +175,10 @@ def synthetic_capture(workload: Workload, counts_per_spot: float = 3000.0, seed:
     wall = np.stack([*np.meshgrid(x, y, indexing="ij"), np.zeros((nx, ny))], axis=-1).reshape(-1, 3)
     sensor = wall if workload.confocal else np.zeros_like(wall)
     points, albedo = (torch.from_numpy(a).float() for a in surface_points(workload, 1.3 * workload.pitch))
-    to_points = lambda a: torch.cdist(
-        torch.from_numpy(a).float(), points, compute_mode="donot_use_mm_for_euclid_dist"
-    )  # noqa: E731
+
+    def to_points(a: np.ndarray) -> Tensor:
+        return torch.cdist(torch.from_numpy(a).float(), points, compute_mode="donot_use_mm_for_euclid_dist")
+
     generator = torch.Generator().manual_seed(seed)
     counts = np.empty((len(wall), workload.bins), dtype=np.uint16)
     for begin in range(0, len(wall), 512):

@@ -11,7 +11,7 @@ import numpy as np
 import pooch
 
 from data_modules.readers import ReaderOptions, read_capture
-from data_modules.simulate import SCENES, ScanPlan, SensorModel, load_truth, simulate_capture
+from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_truth, simulate_capture
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
@@ -28,6 +28,9 @@ def load_scene(
         scene: a config of conf/scene.
         data_dir: folder in which downloaded files are looked for.
         seed: of the photon statistics of a simulated scene.
+
+    Returns:
+        Counts summed and gated as the scene says; the surface as seen from the wall, or None.
 
     Raises:
         UserError: the data are not there (says where they come from and where to put them) or not usable.
@@ -46,8 +49,17 @@ def load_scene(
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
-    """The scene's file: ``path`` as given, else that in ``data_dir``, else downloaded where a URL and a
-    checksum are known.
+    """The scene's file, downloaded where it is missing and a URL and a checksum are known.
+
+    Args:
+        scene: a config of conf/scene.
+        data_dir: where it is looked for; ``scene.path`` comes first.
+
+    Returns:
+        A file, or a folder of files, that is there.
+
+    Raises:
+        UserError: it is not there, with where it comes from and where to put it.
     """
     if scene["path"] is not None:
         path = Path(scene["path"])
@@ -57,7 +69,8 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
     source = scene["source"]
     if source is None:
         raise UserError(
-            f"the scene '{scene['name']}' takes any capture file: give it as scene.path=FILE (docs/formats.md lists the formats)"
+            f"the scene '{scene['name']}' takes any capture file: give it as scene.path=FILE "
+            "(docs/formats.md lists the formats)"
         )
     path = data_dir / source["file"]
     if path.exists():
@@ -70,12 +83,14 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
             )
         except Exception as problem:
             raise UserError(
-                f"could not download {source['url']} ({problem}); fetch it by hand, put it at {path}, or give scene.path=FILE"
+                f"could not download {source['url']} ({problem}); fetch it by hand, put it at {path}, "
+                "or give scene.path=FILE"
             ) from problem
         return Path(fetched)
     raise UserError(
-        f"the scene '{scene['name']}' needs {source['file']}, which is not in {data_dir}/. It comes from {source['origin']}. "
-        f"Download it there and put it at {path}, or give its place as scene.path=FILE"
+        f"the scene '{scene['name']}' needs {source['file']}, which is not in {data_dir}/. "
+        f"It comes from {source['origin']}. Download it there and put it at {path}, "
+        "or give its place as scene.path=FILE"
     )
 
 
@@ -98,5 +113,5 @@ def _simulate(plan: Mapping[str, Any], seed: int) -> tuple[Capture, SurfaceTruth
     return capture, _truth(truth)
 
 
-def _truth(truth) -> SurfaceTruth:
+def _truth(truth: Truth) -> SurfaceTruth:
     return SurfaceTruth(truth.x, truth.y, truth.depth, truth.normal, truth.albedo)

@@ -18,11 +18,21 @@ log = logging.getLogger(__name__)
 
 
 def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
-    """``[S]`` True where a spot is held out: every ``every``-th ``block × block`` patch of the wall, patches
-    staggered row by row.
+    """Which spots are held out: every n-th patch of the wall, patches staggered row by row.
 
     Contiguous patches, because random spots would leak through their neighbours. Without a scanned grid, runs
-    of ``block²`` neighbouring rows of the capture take the place of patches. ``every = 0`` holds out nothing.
+    of ``block²`` neighbouring rows of the capture take the place of patches.
+
+    Args:
+        capture: S spots.
+        block: spots on a side of a patch.
+        every: n; 0 holds out nothing.
+
+    Returns:
+        ``[S]`` True where a spot is held out.
+
+    Raises:
+        UserError: impossible numbers, or all spots or none would be held out.
     """
     if every == 0:
         return np.zeros(capture.n_spots, dtype=bool)
@@ -41,8 +51,8 @@ def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
     held = patch % every == every - 1
     if not held.any() or held.all():
         raise UserError(
-            f"heldout.block={block}, heldout.every={every} hold out {int(held.sum())} of {capture.n_spots} spots; "
-            "choose smaller blocks, or heldout.every=0 to train on all"
+            f"heldout.block={block}, heldout.every={every} hold out {int(held.sum())} of "
+            f"{capture.n_spots} spots; choose smaller blocks, or heldout.every=0 to train on all"
         )
     return held
 
@@ -65,12 +75,23 @@ class SpotSchedule(Sampler[list[int]]):
     """One batch an epoch, from a rolling random permutation of ``spots``: a function of the epoch alone.
 
     Every rank takes its share of the same batch, so the ranks together see what one process would.
+
+    Args:
+        spots: ``[N]`` rows of the capture.
+        batch: spots an epoch, over all ranks together.
+        seed: of the permutations.
+        rank: of this process.
+        ranks: number of processes.
+
+    Raises:
+        UserError: the ranks cannot share a batch evenly.
     """
 
     def __init__(self, spots: np.ndarray, batch: int, seed: int, rank: int = 0, ranks: int = 1) -> None:
         if batch % ranks:
             raise UserError(
-                f"a batch of {batch} spots cannot be shared evenly by {ranks} processes; choose a multiple of {ranks}"
+                f"a batch of {batch} spots cannot be shared evenly by {ranks} processes; "
+                f"choose a multiple of {ranks}"
             )
         self.spots, self.batch, self.seed = spots, min(batch, len(spots) // ranks * ranks), seed
         self.rank, self.ranks, self.epoch = rank, ranks, 0
@@ -90,7 +111,18 @@ class SpotSchedule(Sampler[list[int]]):
 
 
 class SpotBatches(Sampler[list[int]]):
-    """All of ``spots`` once, in order, in batches; every ``ranks``-th batch for this rank."""
+    """All of ``spots`` once, in order, in batches; every ``ranks``-th batch for this rank.
+
+    Args:
+        spots: ``[N]`` rows of the capture.
+        batch: spots at once.
+        rank: of this process.
+        ranks: number of processes.
+
+    Examples:
+        >>> list(SpotBatches(np.arange(5), batch=2, rank=1, ranks=2))
+        [[2, 3]]
+    """
 
     def __init__(self, spots: np.ndarray, batch: int, rank: int = 0, ranks: int = 1) -> None:
         self.batches = [spots[i : i + batch].tolist() for i in range(0, len(spots), batch)][rank::ranks]
@@ -106,8 +138,10 @@ class CaptureDataModule(L.LightningDataModule):
     """Training batches and held-out spots of one capture.
 
     Args:
+        capture: what is fitted.
         batch: spots an iteration, over all ranks together.
-        block, every: of :func:`heldout_mask`.
+        block: spots on a side of a held-out patch.
+        every: every n-th patch is held out; 0 holds out nothing.
         monitor_spots: held-out spots scored while training; all of them are scored before and after.
         seed: of the schedule.
     """

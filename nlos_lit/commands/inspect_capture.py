@@ -17,7 +17,9 @@ from nlos_lit.capture.errors import UserError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 
 @dataclass(frozen=True)
@@ -301,6 +303,7 @@ def _three(values: np.ndarray) -> str:
 
 def _on_wall(figure: Figure, axes: Axes, capture: Capture, values: np.ndarray, title: str) -> None:
     """Values over the wall points, +x to the left and +y up, as one sees the scene from the wall."""
+    image: AxesImage | PathCollection
     points = (
         capture.laser
         if np.ptp(capture.laser, axis=0).max() > np.ptp(capture.sensor, axis=0).max()
@@ -320,7 +323,7 @@ def _on_wall(figure: Figure, axes: Axes, capture: Capture, values: np.ndarray, t
     else:
         places, index = np.unique(np.round(points[:, :2], 6), axis=0, return_inverse=True)
         totals = np.bincount(index.ravel(), weights=values)
-        image = axes.scatter(*places.T, c=totals, s=20, cmap="viridis")
+        image = axes.scatter(places[:, 0], places[:, 1], c=totals, s=20, cmap="viridis")
         axes.set_aspect("equal")
         axes.invert_xaxis()
     figure.colorbar(image, ax=axes)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -109,9 +109,9 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
         options, scan, sensor = map(OmegaConf.to_object, merged)
     except OmegaConfBaseException as error:
         raise UserError(
-            f"cannot use {error.full_key}={given.get(error.full_key)}: {str(error).splitlines()[0]}"
+            f"cannot use {error.full_key}={given.get(error.full_key or '')}: {str(error).splitlines()[0]}"
         ) from error
-    return options, scan, sensor
+    return cast(Options, options), cast(ScanPlan, scan), cast(SensorModel, sensor)
 
 
 def build(scene: str, mesh: str | None) -> Mesh:

@@ -93,12 +93,12 @@ def make_trainer(settings: Mapping[str, Any]) -> L.Trainer:
     for name in ("logger", "callbacks"):
         if name in settings["trainer"]:
             raise UserError(f"trainer.{name} is not read: set the group {name}, {name}.NAME._target_=CLASS")
-    loggers = build_all(settings["logger"], Logger, "logger")
-    callbacks = build_all(settings["callbacks"], L.Callback, "callbacks")
+    loggers: list[Logger] = build_all(settings["logger"], Logger, "logger")
+    callbacks: list[L.Callback] = build_all(settings["callbacks"], L.Callback, "callbacks")
     build = builder(settings["trainer"], L.Trainer, "trainer")
     try:
         return build(logger=loggers or False, callbacks=callbacks)
-    except (MisconfigurationException, ValueError) as error:
+    except (MisconfigurationException, ValueError, TypeError) as error:
         raise UserError(f"Lightning's Trainer cannot be made: {str(error).splitlines()[0]}") from error
 
 

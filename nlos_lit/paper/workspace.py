@@ -175,7 +175,7 @@ class Workspace:
             log.info("computing %s", name)
             arrays = {key: np.asarray(value) for key, value in compute().items()}
             with whole_file(path) as partial:
-                np.savez_compressed(partial, **arrays)
+                np.savez_compressed(partial, **arrays)  # type: ignore[arg-type]  # its stub takes names for flags
         with np.load(path, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}
 

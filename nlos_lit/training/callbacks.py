@@ -102,6 +102,7 @@ class ProgressBar(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show the bar, in one of several processes."""
         if trainer.is_global_zero:
+            assert trainer.max_epochs is not None  # Lightning sets it when a fit begins
             self.ticker = Ticker("iterations", trainer.max_epochs, trainer.current_epoch)
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:

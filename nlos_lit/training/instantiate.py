@@ -49,7 +49,7 @@ def builder(config: Mapping[str, Any], kind: type[T], where: str) -> Callable[..
     return instantiate(dict(config), _partial_=True, _convert_="all")
 
 
-def build_all(configs: Mapping[str, Any], kind: type[T], where: str) -> list[T]:
+def build_all(configs: Mapping[str, Any], kind: type, where: str) -> list[Any]:
     """The objects of a group by name, in order; a name set to null is left out.
 
     Args:

@@ -97,6 +97,7 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
     )
     save_figure(shown, place / "transients.png")
     save_figure(figures.surface_plot(points), place / "surface.png")
+    assert refined.heldout is not None  # held-out spots were given
     return {
         "surfels": len(refined.model),
         "heldout": dataclasses.asdict(refined.heldout),
@@ -177,7 +178,7 @@ def write_results(
         log.warning("mesh.ply: %s", mesh.reason)
     geometry = _geometry(points, run)
     shown = run_figures(module, capture, shown_spots(capture.n_spots, config["export"]["transients"]))
-    if geometry is not None:
+    if geometry is not None and run.truth is not None:
         x, y = run.truth.x, run.truth.y
         shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)
     parameters = module.imaging_parameters()

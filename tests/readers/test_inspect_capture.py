@@ -9,8 +9,8 @@ import pytest
 import reader_files as files
 import scipy.io
 
-import inspect_capture
 from data_modules.readers import READERS, read_capture
+from nlos_lit.commands.inspect_capture import examine, inspect_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.parametrize("name", [name for name in files.WRITERS if name not in ("tsai", "cube")])
 def test_every_format_is_told_and_drawn(tmp_path, capsys, name):
     path = files.WRITERS[name](tmp_path)
-    assert inspect_capture.main([str(path), "--out", str(tmp_path / "out")]) == 0
+    assert inspect_capture([str(path), "--out", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().out
     fmt = read_capture(path).provenance["format"]
     assert told.startswith(f"format       {fmt} (")
@@ -52,7 +52,7 @@ def _lct(folder: Path, scene_bin: int = 1200) -> Path:
 
 def test_depth_of_the_first_return_and_the_direct_pulse(tmp_path):
     capture = read_capture(_lct(tmp_path))
-    findings = inspect_capture.examine(capture)
+    findings = examine(capture)
     # the scene's pulse rises past a fifth of its peak 18 bins before bin 1200: half of 1182 · 1.199 mm
     assert np.median(findings.first_returns) == pytest.approx(0.709, abs=0.012)
     assert findings.pulse == 0
@@ -71,7 +71,7 @@ def test_depth_of_the_first_return_and_the_direct_pulse(tmp_path):
     ],
 )
 def test_what_looks_wrong_is_said(tmp_path, capsys, arguments, warning):
-    assert inspect_capture.main([str(_lct(tmp_path)), "--out", str(tmp_path), *arguments]) == 0
+    assert inspect_capture([str(_lct(tmp_path)), "--out", str(tmp_path), *arguments]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("LOOK AT")]
     assert any(__import__("re").search(warning, line) for line in lines), lines
 
@@ -90,6 +90,6 @@ def test_an_error_is_one_sentence_and_status_2(tmp_path):
 
 def test_the_help_names_every_format(capsys):
     with pytest.raises(SystemExit):
-        inspect_capture.main(["--help"])
+        inspect_capture(["--help"])
     told = capsys.readouterr().out
     assert all(reader.NAME in told for reader in READERS)

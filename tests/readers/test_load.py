@@ -8,21 +8,18 @@ import threading
 
 import numpy as np
 import pytest
-from conftest import ROOT, real_file
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
+from conftest import real_file
 
 from data_modules.load import find_file, load_scene
 from data_modules.readers import write_capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
+from nlos_lit.training.configs import compose
 from nlos_lit.training.outcome import albedo_regions
 
 
 def scene(name: str = "default", *overrides: str) -> dict:
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose("train", overrides=[f"scene={name}", *overrides])
-    return OmegaConf.to_container(config.scene, resolve=True)
+    return compose("train", [f"scene={name}", *overrides])["scene"]
 
 
 SMALL = ("scene.simulate.scan.nx=6", "scene.simulate.scan.ny=4")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,21 +10,16 @@ import pytest
 from data_modules.readers import read_capture
 from data_modules.simulate import load_truth
 from nlos_lit.capture.errors import UserError
+from nlos_lit.commands.simulate import build, parse, simulate
+from nlos_lit.runtime.command_line import sentence_errors
 
-# By its path: this folder has the same name.
-_SPEC = importlib.util.spec_from_file_location(
-    "simulate_command", Path(__file__).resolve().parents[2] / "simulate.py"
-)
-simulate = importlib.util.module_from_spec(_SPEC)
-sys.modules["simulate_command"] = simulate
-_SPEC.loader.exec_module(simulate)
-
+main = sentence_errors(simulate)  # as the door does it
 SMALL = ["nx=3", "ny=4", "bin_length=0.02", "n_bins=100", "width=0.6", "height=0.8"]
 
 
 def test_writes_a_capture_and_its_truth(tmp_path, capsys):
     out = tmp_path / "made" / "letters.hdf5"
-    simulate.main(["scene=letters", f"out={out}", "seed=3", "kind=single", "fixed_point=[0.1,-0.1]", *SMALL])
+    main(["scene=letters", f"out={out}", "seed=3", "kind=single", "fixed_point=[0.1,-0.1]", *SMALL])
     assert "single_laser, 12 spots × 100 bins" in capsys.readouterr().out
     capture = read_capture(out)
     assert capture.kind == "single_laser"
@@ -41,7 +33,7 @@ def test_writes_a_capture_and_its_truth(tmp_path, capsys):
 def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
     out = tmp_path / "x.hdf5"
     small = [*SMALL, "sigma=0.02", "scene=letters", "seed=1"]
-    simulate.main(
+    main(
         [
             f"out={out}",
             "effects=[pile_up,hot_spots]",
@@ -56,7 +48,7 @@ def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
     assert told["pile_up"]["detections"]["value"] == pytest.approx(0.4)
     assert told["hot_spots"]["level"]["value"] == pytest.approx(6)
     assert capture.provenance["exposure"] == 3
-    simulate.main([f"out={tmp_path / 'y.hdf5'}", "exposure=3", *small])
+    main([f"out={tmp_path / 'y.hdf5'}", "exposure=3", *small])
     plain = read_capture(tmp_path / "y.hdf5")
     assert plain.counts.sum() == pytest.approx(3 * 12 * (1500 + 10), rel=0.02)
     assert plain.provenance["sensor"]["background"] == pytest.approx(0.3)
@@ -79,7 +71,7 @@ def test_effects_and_exposure_are_simulated_and_written_down(tmp_path):
 def test_effects_that_make_no_sense_are_one_sentence(arguments, words, tmp_path, capsys):
     out = tmp_path / "a.hdf5"
     with pytest.raises(SystemExit) as end:
-        simulate.main([f"out={out}", *SMALL, *arguments])
+        main([f"out={out}", *SMALL, *arguments])
     assert end.value.code == 2
     assert re.search(words, capsys.readouterr().err)
     assert not out.exists()
@@ -89,7 +81,7 @@ def test_keeps_what_is_already_there(tmp_path, capsys):
     out = tmp_path / "a.hdf5"
     out.write_text("precious")
     with pytest.raises(SystemExit) as end:
-        simulate.main([f"out={out}", *SMALL])
+        main([f"out={out}", *SMALL])
     assert end.value.code == 2
     assert "already there" in capsys.readouterr().err
     assert out.read_text() == "precious"
@@ -108,10 +100,10 @@ def test_keeps_what_is_already_there(tmp_path, capsys):
 )
 def test_arguments_that_make_no_sense_are_explained(arguments, words):
     with pytest.raises(UserError, match=words):
-        simulate.parse(arguments)
+        parse(arguments)
 
 
 @pytest.mark.parametrize(("scene", "mesh"), [("castle", None), ("mesh", None), ("default", "x.obj")])
 def test_scenes_that_do_not_exist_are_explained(scene, mesh):
     with pytest.raises(UserError, match="scene is one of default, letters"):
-        simulate.build(scene, mesh)
+        build(scene, mesh)

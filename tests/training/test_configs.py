@@ -1,23 +1,29 @@
-"""Every config composes, and every key is read by something."""
+"""Every config composes, every key is read by something, and no default is stated twice."""
 
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from conftest import ROOT
-from hydra import compose, initialize_config_dir
+from hydra.errors import ConfigCompositionException
+from hydra.utils import get_class
 from omegaconf import OmegaConf
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.commands.train import make_trainer
 from nlos_lit.model.build import PipelineSettings
-from nlos_lit.surfels.fit import RefineSettings
-
-CONF = ROOT / "conf"
+from nlos_lit.model.objective import Objective
+from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
 
 
 def names(group: str) -> list[str]:
@@ -25,17 +31,21 @@ def names(group: str) -> list[str]:
 
 
 def composed(*overrides: str, command: str = "train") -> dict:
-    overrides = tuple(re.sub(r"=(\d+)$", r"='\1'", override) for override in overrides)
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        config = compose(command, overrides=list(overrides))
-    return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    return compose(command, [re.sub(r"^scene=(\d+)$", r"scene='\1'", override) for override in overrides])
 
 
 GROUPS = {
-    "train": ("scene", "model", "ablation", "trainer", "logger", "experiment", "surfels"),
+    "train": (
+        "scene", "model", "objective", "optimizer", "profile", "ablation", "trainer", "callbacks", "logger",
+        "surfels", "experiment",
+    ),
     "diagnose": ("scene", "model", "surfels", "criticism"),
     "reconstruct": ("scene", "method"),
-}
+}  # fmt: skip
+
+
+def test_every_group_is_looked_at():
+    assert {path.name for path in CONF.iterdir() if path.is_dir()} == {"hydra"}.union(*GROUPS.values())
 
 
 @pytest.mark.parametrize(
@@ -101,46 +111,208 @@ def planes_of(volume: dict) -> int:
 CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0]], dtype=float)
 
 
-def leaves(config: dict, above: str = "") -> list[str]:
-    keys = []
+def leaves(config: dict, above: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Path of keys → value, of everything that is no group."""
     for key, value in config.items():
-        keys += leaves(value, key) if isinstance(value, dict) else [key]
-    return keys
+        if isinstance(value, dict) and value:
+            yield from leaves(value, (*above, key))
+        else:
+            yield (*above, key), value
+
+
+def readers(config: dict, path: tuple[str, ...]) -> tuple[str, ...] | None:
+    """Names that the class which takes a key accepts; None where code reads the key by its name."""
+    for depth in range(len(path) - 1, 0, -1):
+        node = config
+        for key in path[:depth]:
+            node = node[key]
+        if "_target_" in node:
+            assert depth == len(path) - 1, f"{path}: below the arguments of {node['_target_']}"
+            return (*inspect.signature(get_class(node["_target_"])).parameters, "_target_")
+    if path[0] in SETTINGS:
+        return tuple(field.name for field in dataclasses.fields(SETTINGS[path[0]]))
+    return Objective._fields if path[0] == "objective" else None
 
 
 def test_no_key_that_nothing_reads():
     modules = [path for folder in ("nlos_lit", "data_modules") for path in (ROOT / folder).rglob("*.py")]
-    sources = "".join(
-        path.read_text() for path in (*modules, *(ROOT / f"{command}.py" for command in GROUPS))
-    )
-    keys = {
-        key
-        for command, groups in GROUPS.items()
-        for group in groups
-        for name in names(group)
-        for key in leaves(composed(f"{group}={name}", command=command))
-    }
-    assert {"effects", "refine", "toys", "run", "threads"} <= keys
-    unread = {key for key in keys if not re.search(rf"\b{re.escape(key)}\b", sources)}
-    assert not unread
+    sources = "".join(path.read_text() for path in modules)
+    used = "".join(re.findall(r"\$\{[\w.]+\}", "".join(path.read_text() for path in CONF.rglob("*.yaml"))))
+    seen, unread = set(), set()
+    for command, groups in GROUPS.items():
+        for group in groups:
+            for name in names(group):
+                config = composed(f"{group}={name}", command=command)
+                for path, _ in leaves(config):
+                    seen.add(path[-1])
+                    accepted = readers(config, path)
+                    word = rf"\b{re.escape(path[-1])}\b"
+                    if accepted is None and (re.search(word, sources) or re.search(word, used)):
+                        continue
+                    if accepted is None or path[-1] not in accepted:
+                        unread.add(".".join(path))
+    assert {"effects", "refine", "toys", "run", "threads", "iterations", "precision", "dirpath"} <= seen
+    assert unread == set()
+
+
+def stated(path: Path) -> Iterator[tuple[str, Any, Any]]:
+    """Key, value and default of what a config file says about a class."""
+    config = OmegaConf.to_container(OmegaConf.load(path))
+    kind = SETTINGS.get(path.parent.name)
+    if kind is not None:
+        defaults = {field.name: field.default for field in dataclasses.fields(kind)}
+        yield from ((key, value, defaults[key]) for key, value in config.items() if key != "defaults")
+    for node in (config, *config.values()):
+        if isinstance(node, dict) and "_target_" in node:
+            parameters = inspect.signature(get_class(node["_target_"])).parameters
+            yield from ((k, v, parameters[k].default) for k, v in node.items() if k in parameters)
+
+
+def test_no_default_is_stated_twice():
+    """A class states its defaults; a config says what differs."""
+    looked_at = 0
+    for path in CONF.glob("*/*.yaml"):
+        for key, value, default in stated(path):
+            looked_at += 1
+            assert value != (list(default) if isinstance(default, tuple) else default), f"{path.name}: {key}"
+    assert looked_at > 30
+
+
+def test_wrong_types_and_unknown_settings_are_refused():
+    for group, key in (("model", "rays"), ("surfels", "steps"), ("criticism", "spots")):
+        command = "diagnose" if group == "criticism" else "train"
+        with pytest.raises(ConfigCompositionException):
+            composed(f"{group}.{key}=many", command=command)
+        with pytest.raises(ConfigCompositionException):
+            composed(f"{group}.{key}s_=3", command=command)
+        added = composed(f"+{group}.nothing=3", command=command)[group]
+        with pytest.raises(UserError, match=f"{group} has no setting 'nothing'; there are .*{key}"):
+            settings_of(SETTINGS[group], added, group)
+    with pytest.raises(UserError, match="model is incomplete: .*threshold"):
+        settings_of(PipelineSettings, {"rays": 20}, "model")
 
 
 def test_groups_are_the_settings_that_read_them():
-    """Keys that a settings class does not know would only fail when the command runs."""
     for name in names("criticism"):
-        settings = composed(f"criticism={name}", command="diagnose")["criticism"]
-        assert set(settings) == {f.name for f in dataclasses.fields(CriticismSettings)}
-        CriticismSettings(**settings)
+        settings_of(
+            SETTINGS["criticism"], composed(f"criticism={name}", command="diagnose")["criticism"], name
+        )
     for name in names("surfels"):
         for command in ("train", "diagnose"):
-            settings = composed(f"surfels={name}", command=command)["surfels"]
-            assert set(settings) == {f.name for f in dataclasses.fields(RefineSettings)}
-            RefineSettings(**settings)
+            settings_of(SETTINGS["surfels"], composed(f"surfels={name}", command=command)["surfels"], name)
 
 
-def test_the_model_profiles_are_complete_settings():
-    for profile in names("model"):
-        model = composed(f"model={profile}")["model"]
-        settings = {k: v for k, v in model.items() if k in PipelineSettings.__dataclass_fields__}
-        assert set(settings) == set(PipelineSettings.__dataclass_fields__)
-        PipelineSettings(**settings)
+DEFAULT = {
+    "threshold": 0.2, "rays": 200, "step_bins": 1.0, "beta": 1000.0, "fine": 4, "relative_beta": True,
+    "power": 1.0, "depth_exponent": 2.0, "wavelength": None, "wavelength_start": 0.8, "sigma_start": 1.2,
+    "wavelength_range": [0.6667, 2.0], "sigma_range": [0.33, 1.5], "basis_tolerance": 1e-4,
+    "albedo": "free", "albedo_start": 0.5, "splat_sigma": 0.62, "conserve_energy": True,
+    "subtract_splat": True, "jitter_fwhm_ps": 40.0, "decay_per_bin": 5.0, "background_start": None,
+}  # fmt: skip
+PAPER = DEFAULT | {
+    "fine": 1, "relative_beta": False, "power": 2.0, "depth_exponent": 0.0, "conserve_energy": False,
+    "subtract_splat": False, "background_start": 1e-3,
+}  # fmt: skip
+CODE = DEFAULT | {
+    "fine": 1, "relative_beta": False, "albedo": "residual", "conserve_energy": False, "splat_sigma": 0.425,
+    "subtract_splat": False, "background_start": 1e-3,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("profile", "model", "sparsity", "clip"),
+    [("default", DEFAULT, 3e-3, None), ("paper", PAPER, 100.0, None), ("reference_code", CODE, 100.0, 10.0)],
+)
+def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, clip):
+    config = composed(f"model={profile}")
+    assert config["model"] == model
+    assert config["objective"] == {"lambda_sparsity": sparsity, "lambda_albedo": 5e-3, "albedo_planes": 64}
+    assert config["optimizer"] == {
+        "rates": {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3},
+        "clip": clip,
+        "method": {"_target_": "torch.optim.Adam"},
+    }
+    assert config["trainer"]["gradient_clip_val"] == clip
+    assert composed(f"model={profile}", command="diagnose")["model"] == model
+    assert composed(f"model={profile}", "optimizer.clip=3")["optimizer"]["clip"] == 3
+    assert set(names("model")) == {"default", "paper", "reference_code"}
+
+
+def test_the_base_of_a_diagnosis_has_fewer_surfels():
+    """tests/blind and this config speak of the same base."""
+    refined, base = composed()["surfels"], composed(command="diagnose")["surfels"]
+    assert {key: base[key] for key in base if base[key] != refined[key]} == {
+        "surfel_cost": 10.0,
+        "prune": 3.0,
+    }
+
+
+def test_experiments_and_trainers_overrule_what_train_says():
+    quick, ddp = composed("experiment=quick"), composed("trainer=ddp")
+    assert (quick["batch_spots"], quick["heldout"]["monitor_spots"], quick["model"]["rays"]) == (16, 32, 64)
+    assert composed("experiment=evidence")["logger"] == {}
+    assert composed("experiment=quick", "batch_spots=3")["batch_spots"] == 3
+    assert (ddp["threads"], ddp["trainer"]["strategy"], ddp["trainer"]["devices"]) == (1, "ddp", 2)
+    assert composed("trainer=ddp", "threads=2")["threads"] == 2
+
+
+def test_a_trainer_as_the_config_says(tmp_path):
+    settings = composed(f"folder={tmp_path}", "scene.iterations=7", "optimizer.clip=2", "logger=csv")
+    trainer = make_trainer(settings)
+    assert (trainer.max_epochs, trainer.check_val_every_n_epoch, trainer.gradient_clip_val) == (7, 10, 2)
+    assert [type(c).__name__ for c in trainer.callbacks] == [
+        "ScoreHeldout",
+        "History",
+        "ProgressBar",
+        "Figures",
+        "ModelCheckpoint",
+    ]
+    checkpoint = trainer.callbacks[-1]
+    assert (checkpoint.dirpath, checkpoint.filename) == (str(tmp_path / "checkpoints"), "iteration")
+    assert (checkpoint.save_last, checkpoint._every_n_epochs) == (True, 10)
+    assert checkpoint._save_on_train_epoch_end is True
+    assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"]
+    assert make_trainer(composed("logger=none", "trainer.max_epochs=3")).loggers == []
+    both = make_trainer(composed("trainer.precision=64-true", "+trainer.max_time=00:01:00:00"))
+    assert both.precision == "64-true"
+    assert type(both.loggers[0]).__name__ == "TensorBoardLogger"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["+trainer.nothing=1"], "trainer has no argument 'nothing'; .*takes .*precision"),
+        (["trainer.precision=nothing"], "Trainer cannot be made: .*nothing"),
+        (["+trainer.callbacks=[]"], "trainer.callbacks is not read"),
+        (["+callbacks.figures.size=3"], "callbacks.figures has no argument 'size'"),
+        (["+logger.tensorboard.nothing._target_=os.system"], "nothing._target_=os.system is not built"),
+    ],
+)
+def test_what_a_trainer_cannot_use_is_one_sentence(overrides, sentence):
+    with pytest.raises(UserError, match=sentence):
+        make_trainer(composed(*overrides))
+
+
+def test_an_unknown_key_needs_a_plus_and_is_named():
+    with pytest.raises(ConfigCompositionException, match=r"Could not override 'trainer.nothing'"):
+        composed("trainer.nothing=1")
+
+
+def test_a_folder_of_another_version_is_one_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"is not the folder of a finished run: config.yaml is missing"):
+        run_config(tmp_path)
+    config = composed()
+    OmegaConf.save(OmegaConf.create(config), tmp_path / "config.yaml")
+    assert run_config(tmp_path) == config
+    old = {**config, "model": {**config["model"], "clip": None, "rates": {}}}
+    del old["objective"]
+    OmegaConf.save(OmegaConf.create(old), tmp_path / "config.yaml")
+    with pytest.raises(
+        UserError, match=r"another version .* \(it has no objective, model.clip, model.rates\)"
+    ):
+        run_config(tmp_path)
+
+
+def test_another_optimiser_is_a_word():
+    config = composed("optimizer.method._target_=torch.optim.RAdam")
+    assert get_class(config["optimizer"]["method"]["_target_"]) is torch.optim.RAdam

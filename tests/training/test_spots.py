@@ -111,8 +111,9 @@ def test_a_trainer_brings_another_batch_each_iteration(tmp_path):
     data, recorder = module(capture()), Recorder()
     quiet_libraries()
     trainer = L.Trainer(
-        max_epochs=5, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, use_distributed_sampler=False, limit_val_batches=0, default_root_dir=tmp_path,
+        max_epochs=5, accelerator="cpu", logger=False, enable_checkpointing=False,
+        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False,
+        limit_val_batches=0, default_root_dir=tmp_path,
     )  # fmt: skip
     trainer.fit(recorder, datamodule=data)
     schedule = SpotSchedule(data.train_spots, 6, seed=3)

@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 import torch
 from conftest import ROOT
-from hydra import compose, initialize_config_dir
-from omegaconf import OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nlos_lit.capture.errors import UserError
@@ -22,13 +20,16 @@ from nlos_lit.effects.strengths import report
 from nlos_lit.io.points import read_points
 from nlos_lit.io.volumes import read_volume
 from nlos_lit.surfels.refine import score_spots
+from nlos_lit.training.configs import compose
 from nlos_lit.training.outcome import load_refined
 from nlos_lit.training.run_folder import open_run, prepare_run
 
 SMALL = [
-    "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12", "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
+    "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
+    "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
-    "monitor.every=2", "monitor.checkpoint_every=1", "monitor.figures_every=3", "trainer.threads=1",
+    "trainer.check_val_every_n_epoch=2", "callbacks.checkpoint.every_n_epochs=1", "callbacks.figures.every=3",
+    "threads=1",
 ]  # fmt: skip
 
 
@@ -187,7 +188,8 @@ runpy.run_path("train.py", run_name="__main__")
 def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     folder = tmp_path / "resumed"
     done = subprocess.run(
-        [sys.executable, "-c", CTRL_C, *SMALL, "scene.iterations=6", "logger=none", f"hydra.run.dir={folder}"],
+        [sys.executable, "-c", CTRL_C, *SMALL, "scene.iterations=6", "logger=none",
+         f"hydra.run.dir={folder}"],
         cwd=ROOT, capture_output=True, text=True, timeout=300,
     )  # fmt: skip
     output = done.stdout + done.stderr
@@ -249,9 +251,7 @@ def test_the_ablation_grid_leaves_one_table(tmp_path):
     ],
 )
 def test_an_ablation_changes_its_parameters_alone(ablation, groups):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose("train", overrides=[*SMALL, f"ablation={ablation}"])
-    run = prepare_run(OmegaConf.to_container(config, resolve=True))
+    run = prepare_run(compose("train", [*SMALL, f"ablation={ablation}"]))
     before = {name: value.clone() for name, value in run.module.state_dict().items()}
     optimizer = run.module.configure_optimizers()
     batch = next(iter(run.data.train_dataloader()))
@@ -268,9 +268,7 @@ def test_an_ablation_changes_its_parameters_alone(ablation, groups):
 
 @pytest.mark.parametrize("profile", ["default", "paper", "reference_code"])
 def test_every_profile_has_finite_losses_and_gradients(profile):
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose("train", overrides=[*SMALL, f"model={profile}"])
-    run = prepare_run(OmegaConf.to_container(config, resolve=True))
+    run = prepare_run(compose("train", [*SMALL, f"model={profile}"]))
     terms = run.module.objective(next(iter(run.data.train_dataloader())))
     terms["loss"].backward()
     assert all(torch.isfinite(value) for value in terms.values())
@@ -291,6 +289,9 @@ BAD = {
     "memory_budget=1MiB": "the budget is",
     "memory_budget=lots": "must be a size",
     "shard_field=true": "needs trainer=ddp and trainer.devices=2 or more; found trainer.devices=1",
+    "callbacks.figures._target_=os.system": "callbacks.figures._target_=os.system is not built",
+    "+model.nothing=1": "model has no setting 'nothing'",
+    "~callbacks.history": "callbacks must hold History",
     "model.threshold=1.5": "threshold must lie between 0 and 1",
     "heldout.block=50": "hold out",
     "ckpt_path=nothing.ckpt": "does not exist",
