@@ -24,8 +24,9 @@ _TABLE = 1 << 22  # distances from wall points to voxels kept at a time
 
 
 def bp(capture: Capture, grid: VolumeGrid, *, falloff: float = 0.0) -> torch.Tensor:
-    """Backprojection ``I(v) = Σ_s H_s(|v - l_s| + |v - d_s|)``, linear between bin centres, zero outside the
-    gate.
+    """Backprojection ``I(v) = Σ_s H_s(|v - l_s| + |v - d_s|)``.
+
+    Transients are linear between bin centres and zero outside the gate.
 
     Args:
         capture: of any kind; the spots need no order and no plane.

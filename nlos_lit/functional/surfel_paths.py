@@ -136,8 +136,9 @@ def trace(
 def _leg(
     points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel, each ``[B, M, Q]``, of the legs from ``wall`` ``[B, 3]``
-    to the points.
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points ``[B, 3]`` to points.
+
+    Each is ``[B, M, Q]``.
     """
     dx, dy, dz = (p - wall[:, k, None, None] for k, p in enumerate(points))
     square = dx * dx + dy * dy + dz * dz

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from test_pipeline_capture import NORMAL, fields, grid_points
+from small_capture import NORMAL, fields, grid_points
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import MemoryBudgetError
