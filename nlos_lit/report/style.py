@@ -1,4 +1,4 @@
-"""The look that all figures share: colours, line widths, symbols, and the pieces several figures are made of."""
+"""The look that all figures share: colours, type, symbols, and the pieces that several are made of."""
 
 from __future__ import annotations
 
