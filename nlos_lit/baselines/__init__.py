@@ -61,6 +61,17 @@ def reconstruct(
         UserError: unknown method or option.
         CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
         MemoryBudgetError: the estimate is above the budget; nothing was allocated.
+
+    Examples:
+        >>> import numpy as np
+        >>> spot, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+        >>> capture = Capture(np.ones((1, 50)), spot, spot, up, up, bin_length=0.05)
+        >>> grid = VolumeGrid((0.0, 0.0, 0.5), (0.1, 0.1, 0.1), (3, 2, 2))
+        >>> reconstruct(capture, grid, "bp").shape
+        torch.Size([3, 2, 2])
+        >>> reconstruct(capture, grid, "lct")
+        Traceback (most recent call last):
+        nlos_lit.capture.errors.CaptureError: lct needs a confocal scan on a regular planar grid; ...
     """
     function = _checked(capture, grid, method, budget_bytes, options)
     return function(capture, grid, **options)
