@@ -130,9 +130,16 @@ def drawn(
     counts = np.zeros(scene.counts.shape, dtype=np.uint32)
     counts[:, scene.gate[0] :] = np.random.default_rng(seed).poisson(expected)
     return Capture(
-        counts, scene.laser, scene.sensor, scene.laser_normal, scene.sensor_normal, bin_length=scene.bin_length,
-        t_start=scene.t_start, gate=scene.gate, scan_order=scene.scan_order,
-    )  # fmt: skip
+        counts,
+        scene.laser,
+        scene.sensor,
+        scene.laser_normal,
+        scene.sensor_normal,
+        bin_length=scene.bin_length,
+        t_start=scene.t_start,
+        gate=scene.gate,
+        scan_order=scene.scan_order,
+    )
 
 
 def problem_of(
@@ -154,9 +161,8 @@ def fit_of(
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(len(rows), generator=generator)
     extension = Extension([]) if extension is None else extension
-    return SurfelFit(
-        model, scene, None, counts, torch.from_numpy(rows), RefineSettings(), None, extension, generator, order
-    )  # fmt: skip
+    known = (model, scene, None, counts, torch.from_numpy(rows), RefineSettings(), None)
+    return SurfelFit(*known, extension, generator, order)
 
 
 def candidate(

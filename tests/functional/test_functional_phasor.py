@@ -101,8 +101,8 @@ class Scan:
 
     def lattice(self):
         blocks = lattice_phasors(
-            self.field, self.omega, self.basis, pitch=self.pitch, offset=self.offset, shape=self.shape, depth=self.depth,
-            fixed=self.fixed, voxel_origin=self.voxel_origin,
+            self.field, self.omega, self.basis, pitch=self.pitch, offset=self.offset, shape=self.shape,
+            depth=self.depth, fixed=self.fixed, voxel_origin=self.voxel_origin,
         )  # fmt: skip
         return torch.cat(list(blocks))
 

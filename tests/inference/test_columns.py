@@ -64,7 +64,7 @@ def setting(
 
 
 def slope(model: SurfelModel, extension: Extension, spots: Tensor, change: Callable, h: float) -> Tensor:
-    """``[S·bins]`` derivative of the render when ``change(model, extension, step)`` acts in place on copies."""
+    """``[S·bins]`` derivative of the render; ``change(model, extension, step)`` acts in place on copies."""
     ends = []
     for step in (h, -h):
         both = copy.deepcopy(model), copy.deepcopy(extension)

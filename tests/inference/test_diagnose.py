@@ -67,8 +67,8 @@ def finished(tmp_path_factory) -> Path:
 def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     said = json.loads((finished / "diagnosis" / "diagnosis.json").read_text())
     assert set(said) == {
-        "effects", "groups", "unexplained", "screened", "base", "extended", "untouched_test", "witness", "profiles", "numerics",
-        "notes", "capture", "toys", "seconds", "seed",
+        "effects", "groups", "unexplained", "screened", "base", "extended", "untouched_test", "witness",
+        "profiles", "numerics", "notes", "capture", "toys", "seconds", "seed",
     }  # fmt: skip
     assert {s["name"] for s in said["screened"]} == {e.name for e in EFFECTS}
     for one in said["screened"]:
@@ -161,7 +161,7 @@ def test_what_cannot_be_diagnosed_is_one_sentence(tmp_path):
     bad = {
         f"run={tmp_path / 'nowhere'}": "is not the folder of a finished run: config.yaml is missing",
         f"scene=capture scene.path={tmp_path / 'render.hdf5'}": "holds expected values (a render)",
-        "scene.simulate.scan.nx=6 scene.simulate.scan.ny=6": "a diagnosis needs a scan of at least 16 × 16 spots",
+        "scene.simulate.scan.nx=6 scene.simulate.scan.ny=6": "needs a scan of at least 16 × 16 spots",
     }
     for overrides, words in bad.items():
         done = command("diagnose", *SMALL, *overrides.split(), folder=tmp_path / "bad", check=False)

@@ -93,7 +93,7 @@ def test_a_width_is_as_certain_as_its_spots_are_many():
 
 
 def test_hot_spots_are_counted_for_the_whole_scan():
-    """Nine of 2 counts a bin among the fitted three quarters: twelve, give or take √9/0.75; their level is 2."""
+    """Nine of 2 counts a bin among the fitted three quarters: twelve ± √9/0.75; their level is 2."""
     extra = torch.zeros(12)
     extra[:9] = 2.0
     found = known([], torch.zeros(0, 0)).parameters(effect_of("hot_spots", SCAN, extra=extra))
@@ -171,7 +171,7 @@ def test_misfit_between_blocks_widens_the_errors():
 
 @FORWARD_MODE
 def test_errors_are_those_of_repeated_measurements():
-    """Two hundred draws of counts: one-step estimates scatter as the reported errors say, around the truth."""
+    """Two hundred draws: one-step estimates scatter as the reported errors say, around the truth."""
     fit, spots, block = accepted_fit(seed=None)
     found = Uncertainty(fit, spots, fit.counts, block)
     _, z, _ = dense(fit, spots)

@@ -80,6 +80,7 @@ def test_a_ripple_that_stands_for_a_gap_has_not(scene):
     ripple = effect_of("tcspc_nonlinearity", scan)
     found = screen(problem, projector, [ripple], torch.arange(scene.n_spots) % 6)[0]
     assert found.gain > 100, "it is tempting"
+    ripple = found.effect
     ripple.set("sine", 0.02 * float(found.step[0]))
     ripple.set("cosine", 0.02 * float(found.step[1]))
     shape = form(scene, ripple, [], factor)
@@ -147,7 +148,7 @@ def test_a_delay_that_neighbours_share_is_no_jitter(scene):
 
 
 def test_neighbours_are_compared_only_where_a_number_a_spot_is_asked_for(scene):
-    """A base is wrong in places, too: delays that neighbours share flag nothing that nobody would have named."""
+    """A base is wrong in places, too: shared delays flag nothing that nobody would have named."""
     scan, split = Scan.of(scene), split_spots(scene)
     jump = effect_of("timing_jitter", scan, offset=0.015 * torch.where(scan.rank < 0, -1.0, 1.0))
     for measured, asked in (([], {""}), ([jump], {"", "timing_jitter"})):

@@ -39,7 +39,7 @@ def candidate(name: str, statistic: float, size: int = 1) -> Candidate:
 
 
 def test_toys_by_hand(tmp_path):
-    """Ten toys of 3 and 5 in turn: mean 4, variance 10/9; a gamma distribution of shape 14.4 and scale 0.278."""
+    """Ten toys of 3 and 5 in turn: mean 4, variance 10/9; a gamma of shape 14.4 and scale 0.278."""
     for k in range(10):
         text = {"statistic": {"irf_tail": 3.0 + 2 * (k % 2), "power_drift": 0.0}, "largest": 2.5 - k}
         (tmp_path / f"toy_{k}.json").write_text(json.dumps(text))
@@ -271,3 +271,13 @@ def test_a_render_is_refused_in_a_sentence():
     with pytest.raises(UserError, match="at least 16 × 16 spots"):
         diagnose(capture_of(raster(6)), pipeline, CriticismSettings(), name="x", seed=0)
     assert pickle.loads(pickle.dumps(pipeline)) == pipeline
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"statistic": [], "largest": 1}', '{"statistic": {"irf_tail": "x"}}']
+)
+def test_a_toy_that_is_none_is_refused(tmp_path, text):
+    file = tmp_path / "toy_0.json"
+    file.write_text(text)
+    with pytest.raises(UserError, match=r"toy_0\.json is damaged, or holds no toy: move it away"):
+        read_toys([file])

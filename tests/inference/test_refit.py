@@ -164,7 +164,7 @@ def test_group_has_what_the_capture_cannot_tell_apart():
 
 
 def test_significance_is_holms():
-    """Level 1e-3 over four: 2e-4·4 passes, 5e-4·3 does not, and nothing after it does, though 6e-4·1 would."""
+    """Level 1e-3 over four: 2e-4·4 passes, 5e-4·3 does not, nor what follows, though 6e-4·1 would."""
     settings = CriticismSettings()
     four = [("irf_tail", 2e-4), ("pile_up", 5e-4), ("vignetting", 5.5e-4), ("time_offset", 6e-4)]
     candidates = [candidate(name, p) for name, p in reversed(four)]

@@ -4,6 +4,7 @@ nuisance.
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import lru_cache
 
@@ -253,6 +254,18 @@ def test_screening_ranks_by_gain():
     assert [c.gain for c in found] == sorted((c.gain for c in found), reverse=True)
 
 
+def test_screening_leaves_the_effects_it_is_given_alone():
+    given = [effect_of(n, SCAN) for n in ("irf_tail", "power_drift")]
+    before = copy.deepcopy(given)
+    whole = problem(columns(effect_of("irf_tail", SCAN))[:, 0] + normal(ROWS, seed=11))
+    found = screen(whole, Projector(whole), given, FOLD)
+    assert not {id(c.effect) for c in found} & {id(e) for e in given}
+    for effect, old in zip(given, before, strict=True):
+        assert effect.prior_scale == old.prior_scale
+        for value, was in zip(effect.parameters(), old.parameters(), strict=True):
+            assert torch.equal(value, was)
+
+
 def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     """Column 1 at every bin of a spot, F = 6 a spot: δ ~ N(0, 1.5²) is seen as an excess of scatter, and no
     scatter as none.
@@ -265,7 +278,9 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     whole = problem(truth + normal(ROWS, seed=13), nuisance)
     whole.model = type("Model", (), {"laser": torch.zeros(SPOTS + 3, 3)})()
     whole.spots = torch.arange(SPOTS) + 2
-    (found,) = screen(whole, Projector(whole), [effect_of("timing_jitter", SCAN)], FOLD)
+    jitter = effect_of("timing_jitter", SCAN)
+    (found,) = screen(whole, Projector(whole), [jitter], FOLD)
+    assert jitter.width == 0, "the effect that was given is left alone"
     assert found.effect.width == pytest.approx(1.5, rel=0.3)
     assert found.statistic == pytest.approx(2 * found.gain)
     assert found.p_value == pytest.approx(stats.chi2.sf(found.statistic, 1), rel=1e-6)
