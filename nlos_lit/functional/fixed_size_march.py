@@ -146,11 +146,11 @@ def static_march(
     points = unit_origin[line // rays][:, None] + distance[..., None] * unit_world[line][:, None]
     value = sample_unit(volume, points.view(-1, 3)).view(-1, BLOCK)
     value = torch.where((number < count[line][:, None]) & used[:, None] & (value >= threshold), value, -1.0)
-    peak = torch.full((spots * rays,), -1.0, device=volume.device).scatter_reduce(
+    peak = torch.full((spots * rays,), -1.0, device=volume.device, dtype=value.dtype).scatter_reduce(
         0, line, value.amax(1), "amax"
     )
     at_peak = torch.where((value == peak[line][:, None]) & (value > 0), distance, torch.inf).amin(1)
-    best = torch.full((spots * rays,), torch.inf, device=volume.device).scatter_reduce(
+    best = torch.full((spots * rays,), torch.inf, device=volume.device, dtype=value.dtype).scatter_reduce(
         0, line, at_peak, "amin"
     )
     line, used, needed_rays = compact(peak > 0, capacity.rays)

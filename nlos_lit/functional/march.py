@@ -294,7 +294,7 @@ def march(
     scale, shift = unit_scale(lattice)
     unit_origin = ((origins - lattice.origin) * scale + shift)[:, [1, 0, 2]]
     unit_world = (world * scale)[:, [1, 0, 2]]
-    peak = torch.zeros(origins.shape[0] * n * n, device=device)
+    peak = torch.zeros(origins.shape[0] * n * n, device=device, dtype=volume.dtype)
     kept: list[tuple[Tensor, Tensor, Tensor]] = []
     for pair, line in _candidates(cells, extent, lattice.origin, origins, frames, n, chunk):
         promising = torch.nonzero(
@@ -332,7 +332,7 @@ def march(
     line, distance = line[near_peak], distance[near_peak]
     hits, hit = torch.unique(line, return_inverse=True)
     if fine > 1:
-        best = torch.zeros(len(hits), device=device).scatter_reduce(
+        best = torch.zeros(len(hits), device=device, dtype=distance.dtype).scatter_reduce(
             0, hit, distance, "amin", include_self=False
         )
         offsets = torch.arange(-fine, fine + 1, device=device) * (step / fine)

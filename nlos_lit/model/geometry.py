@@ -219,14 +219,14 @@ class ImplicitGeometry(nn.Module):
         # With a relative β the largest intensity scales the exponent, so the gradient passes through it;
         # otherwise it cancels.
         largest = value if self.relative else value.detach()
-        top = torch.full((hits,), -torch.inf, device=value.device).scatter_reduce(
+        top = torch.full((hits,), -torch.inf, device=value.device, dtype=value.dtype).scatter_reduce(
             0, samples.hit, largest, "amax"
         )
         sharpness = self.beta / top if self.relative else self.beta * torch.ones_like(top)
         weight = torch.exp(sharpness[samples.hit] * (value - top[samples.hit]))
         if static is not None:
             weight = torch.where(static.inside, weight.view_as(static.inside), 0.0).view(-1)
-        zeros = torch.zeros(hits, device=value.device)
+        zeros = torch.zeros(hits, device=value.device, dtype=value.dtype)
         total = zeros.index_add(0, samples.hit, weight)
         # Relative to the first sample, so that float32 keeps the sub-step digits.
         base = zeros.scatter_reduce(0, samples.hit, samples.distance, "amin", include_self=False)
