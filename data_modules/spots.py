@@ -97,6 +97,7 @@ class SpotSchedule(Sampler[list[int]]):
         self.rank, self.ranks, self.epoch = rank, ranks, 0
 
     def set_epoch(self, epoch: int) -> None:
+        """Choose the iteration whose batch comes next; Lightning calls it."""
         self.epoch = epoch
 
     def __len__(self) -> int:
@@ -182,9 +183,11 @@ class CaptureDataModule(L.LightningDataModule):
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer is not None else (0, 1)
 
     def train_dataloader(self) -> DataLoader:
+        """One batch of training spots an epoch, this rank's share."""
         return self._loader(SpotSchedule(self.train_spots, self.batch, self.seed, *self._place()))
 
     def val_dataloader(self) -> DataLoader:
+        """The monitored held-out spots, this rank's share."""
         return self._loader(SpotBatches(self.monitored, self.batch, *self._place()))
 
     def heldout_dataloader(self) -> DataLoader:

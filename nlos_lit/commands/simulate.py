@@ -84,8 +84,8 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
 
     Examples:
         >>> options, scan, _ = parse(["scene=letters", "nx=8", "effects=pile_up"])
-        >>> options.scene, scan.nx, options.effects
-        ('letters', 8, ('pile_up',))
+        >>> options.scene, scan.nx, list(options.effects)
+        ('letters', 8, ['pile_up'])
     """
     arguments = [argument for argument in arguments if "." not in argument.partition("=")[0]]
     names = [{field.name: field.default for field in dataclasses.fields(section)} for section in SECTIONS]

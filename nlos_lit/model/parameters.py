@@ -19,6 +19,11 @@ class BoundedParameter(nn.Module):
 
     Raises:
         ValueError: the start value does not lie between the bounds.
+
+    Examples:
+        >>> width = BoundedParameter(2.0, lower=1.0, upper=4.0, unit="m")
+        >>> round(width().item(), 4), width.raw.item()
+        (2.0, 0.0)
     """
 
     def __init__(self, initial: float, lower: float, upper: float, unit: str) -> None:
@@ -32,7 +37,9 @@ class BoundedParameter(nn.Module):
         self.raw = nn.Parameter(torch.tensor(math.log(share / (1 - share))))
 
     def forward(self) -> Tensor:
+        """The quantity, in ``unit``, scalar."""
         return self.lower * torch.exp(math.log(self.upper / self.lower) * torch.sigmoid(self.raw))
 
     def extra_repr(self) -> str:
+        """Value and bounds, for ``print(module)``."""
         return f"{float(self()):.6g} {self.unit} in [{self.lower:.4g}, {self.upper:.4g}]"

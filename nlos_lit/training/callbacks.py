@@ -30,13 +30,23 @@ class ScoreHeldout(L.Callback):
     """
 
     def on_fit_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Score the start values, unless the run goes on from a checkpoint that holds these scores."""
+        """Score the start values, unless the run goes on from a checkpoint that holds these scores.
+
+        Args:
+            trainer: its data module holds the spots.
+            module: what is scored; gets ``scores["initial"]``.
+        """
         module = cast(SelfCalibration, module)
         if not module.scores:
             module.scores = {"initial": self._score(trainer, module)}
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Score what was fitted."""
+        """Score what was fitted.
+
+        Args:
+            trainer: its data module holds the spots.
+            module: what is scored; gets ``scores["final"]``.
+        """
         module = cast(SelfCalibration, module)
         module.scores["final"] = self._score(trainer, module)
 

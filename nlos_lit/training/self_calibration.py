@@ -52,6 +52,7 @@ class SelfCalibration(L.LightningModule):
         self._freeze()
 
     def setup(self, stage: str) -> None:
+        """Make what the processes share, once they know each other."""
         if self._prepare is not None:
             self.pipeline.to(self.trainer.strategy.root_device)
             self._prepare()
@@ -77,10 +78,27 @@ class SelfCalibration(L.LightningModule):
         return self.criterion.terms(self.pipeline, batch["spots"], batch["counts"], self.global_step)
 
     def regularisation(self, intensity: Tensor, albedo: Tensor) -> dict[str, Tensor]:
-        """E_Ipf and E_ρ with their factors, over a volume and (planes of) an albedo volume."""
+        """E_Ipf and E_ρ with their factors.
+
+        Args:
+            intensity: ``[nz, nx, ny]`` I_pf.
+            albedo: ``[m, nx, ny]`` ρ, or planes of it.
+
+        Returns:
+            ``sparsity`` and ``albedo``, scalars.
+        """
         return self.criterion.regularisation(intensity, albedo)
 
     def training_step(self, batch: dict[str, Tensor], batch_idx: int) -> dict[str, Tensor]:
+        """One iteration; its terms go to the loggers.
+
+        Args:
+            batch: ``spots`` ``[S]`` and gated ``counts`` ``[S, T]``.
+            batch_idx: always 0, an epoch is one batch.
+
+        Returns:
+            Loss terms as :meth:`objective` gives them; Lightning descends along ``loss``.
+        """
         terms = self.objective(batch)
         if self.global_step % 10 == 0 and self.pipeline.geometry.renew_capacity():
             log.warning(
@@ -93,13 +111,21 @@ class SelfCalibration(L.LightningModule):
         return terms
 
     def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
+        """Add a batch of monitored held-out spots to the scores.
+
+        Args:
+            batch: as in :meth:`training_step`.
+            batch_idx: not looked at.
+        """
         self._add_score(batch)
 
     def on_validation_epoch_start(self) -> None:
+        """Empty the sums, keep the volume: parameters stand still meanwhile."""
         self.pipeline.phasor.hold()
         self._sums = torch.zeros(6, dtype=torch.float64, device=self.device)
 
     def on_validation_epoch_end(self) -> None:
+        """Send the scores to the loggers as ``heldout/NAME``."""
         for name, value in self._finish_score().items():
             self.log(f"heldout/{name}", value)
 
@@ -116,9 +142,11 @@ class SelfCalibration(L.LightningModule):
         return self.make_optimizer(rated_groups(self.pipeline, self.rates, self.optimised))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Keep the scores from before the first iteration."""
         checkpoint["scores"] = self.scores
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Take them back."""
         self.scores = checkpoint["scores"]
 
     def _freeze(self) -> None:

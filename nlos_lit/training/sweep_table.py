@@ -31,6 +31,7 @@ class SweepTable(Callback):
     """Hydra callback: after a multirun, ``table.csv`` and ``table.md`` in the sweep's folder."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write the table of all jobs that left a summary."""
         folder = Path(config.hydra.sweep.dir)
         rows = sweep_rows(folder)
         if rows:

@@ -188,7 +188,7 @@ def test_wrong_types_and_unknown_settings_are_refused():
         added = composed(f"+{group}.nothing=3", command=command)[group]
         with pytest.raises(UserError, match=f"{group} has no setting 'nothing'; there are .*{key}"):
             settings_of(SETTINGS[group], added, group)
-    with pytest.raises(UserError, match="model is incomplete: .*threshold"):
+    with pytest.raises(UserError, match=r"model is incomplete: .*threshold"):
         settings_of(PipelineSettings, {"rays": 20}, "model")
 
 

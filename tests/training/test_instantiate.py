@@ -65,7 +65,7 @@ def test_nothing_else_is_called(target, place, tmp_path):
         "list": {**TRAINER, "plugins": [evil]},
         "dict": {**TRAINER, "max_time": {"days": [{"more": evil}]}},
     }[place]
-    with pytest.raises(UserError, match="_target_=.* is not built: it must be a class"):
+    with pytest.raises(UserError, match=r"_target_=.* is not built: it must be a class"):
         builder(config, L.Trainer, "trainer")
     assert not file.exists()
 
@@ -91,7 +91,7 @@ def test_interpolations_are_looked_at_where_they_lead():
 
 
 def test_a_config_that_names_no_class_is_refused():
-    with pytest.raises(UserError, match="logger.csv must name a class as _target_; found 'yes'"):
+    with pytest.raises(UserError, match=r"logger.csv must name a class as _target_; found 'yes'"):
         build_all({"csv": "yes"}, Logger, "logger")
 
 
@@ -104,6 +104,6 @@ def test_a_foreign_run_folder_runs_nothing(tmp_path):
     assert not (tmp_path / "touched").exists()
     config = compose("train", [*small, "~optimizer.rates.sensor"])
     with pytest.raises(
-        UserError, match="optimizer.rates must give one rate for each of phasor, sensor, albedo"
+        UserError, match=r"optimizer.rates must give one rate for each of phasor, sensor, albedo"
     ):
         prepare_run(config).module.configure_optimizers()
