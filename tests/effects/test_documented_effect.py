@@ -65,7 +65,7 @@ class TestTheExample(EffectContract):
 
 
 def test_the_line_names_the_file():
-    assert LINE == f'"{NAME}",'
+    assert f'"{NAME}",' == LINE
 
 
 def test_the_example_s_own_examples_run(glow):
