@@ -77,7 +77,7 @@ def imported(tree: ast.AST) -> set[str]:
 
 
 def room_of(module: str) -> str:
-    """``nlos_lit.capture.scan`` → ``capture``, ``data_modules.load`` → ``data_modules``, ``train`` → itself."""
+    """``nlos_lit.capture.scan`` → ``capture``, ``data_modules.load`` → ``data_modules``, ``train`` itself."""
     parts = module.split(".")
     return parts[1] if parts[0] == "nlos_lit" and len(parts) > 1 else parts[0]
 
