@@ -60,7 +60,16 @@ class HotSpots(Effect):
         return {"level": "counts/bin", "number": "1"}
 
     def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
-        """Spots at random, each with 0.5 to 1.5 of the level on average; what is not given is typical."""
+        """Spots at random, each with 0.5 to 1.5 of the level.
+
+        Args:
+            values: ``level``, counts/bin on average over the hot spots, and their ``number``; what is not
+                given is typical.
+            rng: for the spots and their shares of the level.
+
+        Raises:
+            UserError: the level is negative or too large, or the number is not one of spots.
+        """
         values, spots = {**self.typical(self.scan), **values}, self.scan.n_spots
         level, number = self.given_size(values, "level"), values["number"]
         if number != int(number) or not 1 <= number <= spots:

@@ -81,7 +81,15 @@ class SmoothEffect(Effect):
         return {"rms": self.declared[self.coefficients].unit}
 
     def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
-        """A random function of the effect's own basis, of exactly the root mean square given."""
+        """A random function of the effect's own basis, of exactly the root mean square given.
+
+        Args:
+            values: ``rms`` in the coefficients' unit.
+            rng: for the coefficients, normal deviates before they are scaled.
+
+        Raises:
+            UserError: it is negative or too large, or the scan has too few spots.
+        """
         field = rng.standard_normal(self.functions.shape[1])
         size = float((self.functions.double() @ torch.from_numpy(field)).square().mean().sqrt())
         if size == 0:

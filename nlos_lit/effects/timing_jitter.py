@@ -56,7 +56,15 @@ class TimingJitter(Effect):
         return {"sigma": "m"}
 
     def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
-        """Normal deviates of the width given, one for each spot."""
+        """Normal deviates of the width given, one for each spot.
+
+        Args:
+            values: ``sigma``, m of path.
+            rng: for the deviates.
+
+        Raises:
+            UserError: it is negative or too large.
+        """
         sigma = self.given_size(values, "sigma")
         drawn = torch.from_numpy(sigma * rng.standard_normal(self.scan.n_spots))
         self.set_given("offset", drawn, "sigma")
