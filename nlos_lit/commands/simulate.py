@@ -57,9 +57,6 @@ class Options:
 
 
 SECTIONS = (Options, ScanPlan, SensorModel)
-EFFECT_HELP = (
-    f"effects are {', '.join(effect.name for effect in EFFECTS)}, their strengths EFFECT.PARAMETER=VALUE"
-)
 SCENE_HELP = f"scene is one of {', '.join(SCENES)}, mesh (with mesh=FILE) or two_albedo (with mesh=FILE)"
 
 
@@ -97,7 +94,8 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
         if not any(key in section for section in names):
             raise UserError(
                 f"there is no option {key!r}; the options are key=value, with these defaults: {keys}\n"
-                f"{SCENE_HELP}\n{EFFECT_HELP}"
+                f"{SCENE_HELP}\n"
+                f"effects are {', '.join(EFFECTS.names)}, their strengths EFFECT.PARAMETER=VALUE"
             )
     try:
         merged = (

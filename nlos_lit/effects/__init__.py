@@ -54,6 +54,9 @@ def build_effects(names: Iterable[str], scan: Scan) -> list[Effect]:
         names: of the registry, in any order.
         scan: of the capture.
 
+    Returns:
+        One for each name.
+
     Raises:
         UserError: a name is not in the registry.
     """

@@ -210,6 +210,9 @@ class Effect(nn.Module, Hooks):
             values: by the names of :meth:`settable`.
             name: of the one.
 
+        Returns:
+            The value, 0 or more.
+
         Raises:
             UserError: it is below 0.
         """

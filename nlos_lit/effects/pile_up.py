@@ -74,6 +74,9 @@ def laser_cycles(photons: Tensor, detections: float) -> float:
         photons: ``[S]`` M, expected at each spot.
         detections: counts recorded a cycle, averaged over the spots.
 
+    Returns:
+        N, not rounded.
+
     Raises:
         UserError: spots without photons are too many for that.
 

@@ -68,6 +68,9 @@ class Registry(Sequence[type[Effect]]):
         Args:
             effect: the new one.
             after: name of the effect that acts right before it.
+
+        Yields:
+            Nothing; it is in the registry until the block is left.
         """
         before = list(self._effects)
         self._effects.insert(self.names.index(after) + 1, effect)

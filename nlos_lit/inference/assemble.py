@@ -61,6 +61,9 @@ def assemble(
         name: of the capture.
         seconds: the diagnosis took.
         seed: of it.
+
+    Returns:
+        The result, as it is written and shown.
     """
     base, final = found.base, found.final
     rows = tested_rows(final, split, settings.spots, seed)
@@ -157,13 +160,16 @@ def _of_another_form(form: Form) -> str:
 def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
     """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain.
 
+    A map that was taken back because it follows the count rate says so itself; another effect of the wrong
+    form only where nothing else does.
+
     Args:
         found: by the loop.
         split: of the spots.
         settings: of the criticism.
 
-    A map that was taken back because it follows the count rate says so itself; another effect of the wrong
-    form only where nothing else does.
+    Returns:
+        What is left, and whether it casts doubt on the names.
     """
     rest = [
         d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain
@@ -208,6 +214,9 @@ def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
         again: the rebuild, with effects.
         base: without them.
         split: of the spots; those selected with decide.
+
+    Returns:
+        True where its effects may be looked at.
     """
     with_, without = (float(log_likelihood(fit, split.select).sum()) for fit in (again, base))
     return with_ > without

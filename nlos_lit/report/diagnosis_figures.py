@@ -81,6 +81,9 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
     Args:
         profile: before and after; one panel where nothing changed.
         bin_length: m; where it is known, the time axis is told in ns, too.
+
+    Returns:
+        One or two panels.
     """
     panels = _panels(profile)
     figure = Figure(figsize=(7.5, 0.9 + 1.9 * len(panels)))
@@ -143,6 +146,9 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
     Args:
         screened: grey and hatched where an effect can hardly be told from the scene.
         accepted: names of effects that are ticked.
+
+    Returns:
+        One panel, a bar for each effect.
     """
     ranked = by_gain(screened)
     figure = Figure(figsize=(8, 1.3 + 0.27 * len(ranked)))
@@ -190,6 +196,9 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
     Args:
         effects: that were accepted.
         bin_length: m, where known.
+
+    Returns:
+        A panel for each parameter.
     """
     rows = [(e.name, n, p) for e in effects for n, p in e.parameters.items()]
     figure = Figure(figsize=(8, 0.5 + 0.62 * len(rows)))
@@ -288,6 +297,9 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
     Args:
         screened: grey where the scene can imitate an effect.
         bin_length: m, where known.
+
+    Returns:
+        A panel for each unit, a row for each amplitude.
     """
     panels: dict[str, list[tuple[str, float, bool, bool]]] = {}
     for one in screened:
@@ -351,6 +363,9 @@ def witness_maps(
         maps: ``direct`` and ``fitted``, both ``[nx, ny]``.
         ends: first and last edge of the wall in x and y, m; None counts spots.
         r: their correlation.
+
+    Returns:
+        Three panels.
     """
     relative = [
         values / np.nanmean(values)
@@ -396,6 +411,9 @@ def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
     Args:
         fitted: m of path.
         direct: m of path, early to late.
+
+    Returns:
+        One panel.
     """
     factor, unit = scales_of("time", "m", fitted, None)[0]
     figure = Figure(figsize=(6, 1.7))

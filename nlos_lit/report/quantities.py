@@ -79,7 +79,10 @@ def plus_minus(value: float, stderr: float) -> str:
 
     Args:
         value: estimate.
-        stderr: its standard error, in the same unit; ``?`` where it is not a positive number.
+        stderr: its standard error, in the same unit.
+
+    Returns:
+        ``value ± ?`` where the error is not a positive number.
 
     Examples:
         >>> plus_minus(0.2113, 0.021), plus_minus(5.4321, 0.0123)
@@ -211,7 +214,10 @@ def headline(effect: str, parameters: Mapping[str, Estimate]) -> str:
 
     Args:
         effect: its name.
-        parameters: by name; parameter by parameter where the effect's sentence does not fit them.
+        parameters: by name.
+
+    Returns:
+        The effect's own sentence; parameter by parameter where that does not fit them.
 
     Examples:
         >>> headline("irf_tail", {"fraction": Estimate(0.2, 0.02, "1"), "decay": Estimate(0.117, 0.006, "m")})

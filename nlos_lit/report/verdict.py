@@ -97,6 +97,9 @@ def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
     Args:
         diagnosis: the whole.
         listed: say each of several things; else they are only counted.
+
+    Returns:
+        What is missing, how much of the misfit it explains, and whether something else is wrong.
     """
     found = missing(diagnosis)
     axis = AXES.get(diagnosis.unexplained.axis, "on some axis")

@@ -105,6 +105,9 @@ def planned_scan(scan: ScanPlan, sensor: SensorModel) -> Scan:
     Args:
         scan: its points and bins.
         sensor: for the level of the counts.
+
+    Returns:
+        As :meth:`Scan.of` would have it, the background as stated.
     """
     laser, point = scan.points()
     up = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
@@ -135,6 +138,9 @@ def truth_surfels(
         intensity: counts per unit of H_r.
         two_sided: triangles reflect on both sides.
         detail: factor on the number of patches along a line.
+
+    Returns:
+        The model, with who sees whom.
     """
     ends = np.concatenate(
         [np.c_[capture.laser, capture.laser_normal], np.c_[capture.sensor, capture.sensor_normal]]
