@@ -9,8 +9,9 @@ import pytest
 import reader_files as files
 import scipy.io
 
+from data_modules.examine import examine
 from data_modules.readers import READERS, read_capture
-from nlos_lit.commands.inspect_capture import examine, inspect_capture
+from nlos_lit.commands.inspect_capture import inspect_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 
