@@ -11,8 +11,9 @@ STAMP := $(VENV)/.installed
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
+# Two tests at a time, with a thread each.
 test: $(STAMP)
-	$(VENV)/bin/python -m pytest $(ARGS)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist worksteal $(ARGS)
 
 slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)
