@@ -13,7 +13,7 @@ run: $(STAMP)
 
 # Two tests at a time, with a thread each.
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist worksteal $(ARGS)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)
