@@ -193,13 +193,11 @@ def test_wrong_types_and_unknown_settings_are_refused():
 
 
 def test_groups_are_the_settings_that_read_them():
-    for name in names("criticism"):
-        settings_of(
-            SETTINGS["criticism"], composed(f"criticism={name}", command="diagnose")["criticism"], name
-        )
-    for name in names("surfels"):
-        for command in ("train", "diagnose"):
-            settings_of(SETTINGS["surfels"], composed(f"surfels={name}", command=command)["surfels"], name)
+    readers = [("criticism", "diagnose"), ("surfels", "train"), ("surfels", "diagnose")]
+    for group, command in readers:
+        for name in names(group):
+            section = composed(f"{group}={name}", command=command)[group]
+            assert isinstance(settings_of(SETTINGS[group], section, name), SETTINGS[group])
 
 
 DEFAULT = {
