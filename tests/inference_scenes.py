@@ -18,7 +18,8 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.problem import Problem
 from nlos_lit.inference.screen import Candidate
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.fit import RefineSettings, SurfelFit
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
+from nlos_lit.surfels.growth import Seeds
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 BIN, T_START, GATE = 0.02, 0.62, (6, 64)
@@ -161,7 +162,8 @@ def fit_of(
     generator = torch.Generator().manual_seed(0)
     order = torch.randperm(len(rows), generator=generator)
     extension = Extension([]) if extension is None else extension
-    known = (model, scene, None, counts, torch.from_numpy(rows), RefineSettings(), None)
+    nowhere = Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
+    known = (model, scene, None, counts, torch.from_numpy(rows), SurfelSettings(), nowhere)
     return SurfelFit(*known, extension, generator, order)
 
 

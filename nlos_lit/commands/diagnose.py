@@ -31,7 +31,7 @@ from nlos_lit.runtime.command_line import (
 )
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.runtime.progress import StepTicker
-from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import register_settings, settings_of
 from nlos_lit.training.run_folder import Run, open_run
 
@@ -70,7 +70,7 @@ def diagnose(config: DictConfig) -> None:
     pipeline = BasePipeline(
         volume=scene["volume"],
         model=settings_of(PipelineSettings, model, "model"),
-        surfels=settings_of(RefineSettings, settings["surfels"], "surfels"),
+        surfels=settings_of(SurfelSettings, settings["surfels"], "surfels"),
         budget=parse_bytes(settings["memory_budget"]),
     )
     image = None

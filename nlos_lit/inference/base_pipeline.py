@@ -15,8 +15,8 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.split import Split
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.runtime.memory import check_machine
-from nlos_lit.surfels.fit import RefineSettings, SurfelFit
-from nlos_lit.surfels.refine import refine
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
+from nlos_lit.surfels.fitted import fit_surfels
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class BasePipeline:
 
     volume: Mapping[str, Any]
     model: PipelineSettings
-    surfels: RefineSettings
+    surfels: SurfelSettings
     budget: int
 
     def image(self, capture: Capture) -> tuple[Tensor, VolumeGrid]:
@@ -65,7 +65,8 @@ class BasePipeline:
         Returns:
             the fit, converged.
         """
-        return refine(capture, *image, self.surfels, split.fit, extension=extension, seed=seed).fit
+        given = (capture, *image, self.surfels, split.fit)
+        return fit_surfels(*given, extension=extension, seed=seed).fit
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
         """Image and fit without effects."""

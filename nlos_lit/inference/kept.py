@@ -16,8 +16,7 @@ from nlos_lit.inference.discrepancy import Discrepancy
 from nlos_lit.inference.form import Form
 from nlos_lit.inference.screen import Candidate
 from nlos_lit.runtime.plain_file import Kind, record
-from nlos_lit.surfels.fit import RefineSettings, SurfelFit
-from nlos_lit.surfels.growth import Seeds
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 
 
 def kinds(scan: Scan) -> list[Kind]:
@@ -27,7 +26,7 @@ def kinds(scan: Scan) -> list[Kind]:
         return _effect(scan, **parts)
 
     return [
-        *(record(of) for of in (Look, Candidate, Discrepancy, Form, VolumeGrid, Seeds, RefineSettings)),
+        *(record(of) for of in (Look, Candidate, Discrepancy, Form, VolumeGrid, SurfelSettings)),
         Kind(SurfelFit, SurfelFit.parts, SurfelFit.of_parts),
         Kind(Extension, lambda e: {"effects": list(e.effects)}, lambda parts: Extension(**parts)),
         Kind(Effect, _parts, effect),

@@ -13,7 +13,7 @@ from nlos_lit.inference.per_spot import factors, solve, sparse, spot_scores
 from nlos_lit.inference.screen import Candidate
 from nlos_lit.metrics.transients import Scores
 from nlos_lit.surfels.fit import SurfelFit
-from nlos_lit.surfels.refine import score_spots
+from nlos_lit.surfels.fitted import score_spots
 
 BOOTSTRAP = 400
 

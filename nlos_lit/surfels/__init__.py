@@ -1,1 +1,1 @@
-"""The refined scene: surfels fitted to the raw counts, with physical effects."""
+"""The surface of a scene: surfels fitted to the raw counts, with physical effects."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.metrics.transients import transient_scores
 from nlos_lit.model.parameters import BoundedParameter
+from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel
 
@@ -26,7 +27,7 @@ WORTH = 0.02  # nats a parameter that another round must gain
 
 
 @dataclass(frozen=True)
-class RefineSettings:
+class SurfelSettings:
     """How surfels are seeded and fitted.
 
     Args:
@@ -40,7 +41,7 @@ class RefineSettings:
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
             twice as many.
-        more: last rounds that may follow, see :meth:`SurfelFit.converge`.
+        more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the
             unconstrained values.
@@ -86,8 +87,77 @@ class RefineSettings:
             )
 
 
+@dataclass(frozen=True)
+class Round:
+    """One round of a fit; surfels die, grow and are hidden anew between rounds only.
+
+    Args:
+        steps: batches.
+        left: rounds that follow by plan; the last one cools down, and the tie tightens towards it.
+        settling: it comes from seeds, and the response waits for their places.
+        grow: surfels die and grow before it.
+        shapes: scanned parameters of effects start anew before it, where the counts ask for them.
+    """
+
+    steps: int
+    left: int = 0
+    settling: bool = False
+    grow: bool = False
+    shapes: bool = False
+
+
+def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) -> list[Round]:
+    """A plan of rounds, the last twice as long; surfels die and grow between.
+
+    Args:
+        steps: batches a round.
+        count: how many rounds.
+        settle: the first comes from seeds.
+        grow_first: surfels die and grow before the first, too.
+
+    Returns:
+        ``count`` rounds.
+
+    Examples:
+        >>> [(each.steps, each.left, each.grow) for each in rounds_of(100, 3, settle=True)]
+        [(100, 2, False), (100, 1, True), (200, 0, True)]
+    """
+    return [
+        Round(steps if left else 2 * steps, left, settle and index == 0, grow=index > 0 or grow_first)
+        for index, left in enumerate(reversed(range(count)))
+    ]
+
+
+def plan_from_seeds(settings: SurfelSettings, scan_shapes: bool) -> list[Round]:
+    """The rounds from seeds to the fitted scene, without those that may follow.
+
+    Args:
+        settings: of the fit.
+        scan_shapes: a first round of its own comes before scanned parameters of effects are started.
+
+    Returns:
+        the plan.
+    """
+    if not scan_shapes:
+        return rounds_of(settings.steps, settings.rounds, settle=True)
+    first, *later = rounds_of(settings.steps, max(1, settings.rounds - 1), settle=False, grow_first=True)
+    return [*rounds_of(settings.steps, 1, settle=True), replace(first, shapes=True), *later]
+
+
 class SurfelFit:
     """A model on its way to the counts of the training spots.
+
+    What is to be done is a plan of rounds (:meth:`schedule`), and each round a number of batches::
+
+        while not fit.finished:
+            if not fit.in_round:
+                fit.begin_round()
+            fit.step()
+            if fit.round_done:
+                fit.end_round()
+
+    Between any two of these calls :meth:`state` is all that the fit is; one that is restored from it goes on
+    to the last digit.
 
     Args:
         model: where it begins.
@@ -99,6 +169,13 @@ class SurfelFit:
         extension: effects that are fitted along, in place.
         generator: draws the batches.
         order: ``[N]`` permutation of the training rows, the first of which are used to test surfels.
+
+    Attributes:
+        done: batches so far.
+        plan: the present round, if any, and those that follow.
+        history: one entry a finished round: surfels, mean loss over its last quarter, response.
+        losses: of the batches of the present round.
+        optimizer: of the present round; None between rounds.
     """
 
     def __init__(
@@ -108,7 +185,7 @@ class SurfelFit:
         grid: VolumeGrid,
         counts: Tensor,
         train: Tensor,
-        settings: RefineSettings,
+        settings: SurfelSettings,
         reserve: Seeds,
         extension: Extension,
         generator: torch.Generator,
@@ -116,8 +193,13 @@ class SurfelFit:
     ) -> None:
         self.model, self.capture, self.grid, self.counts, self.train = model, capture, grid, counts, train
         self.settings, self.reserve, self.extension, self.generator = settings, reserve, extension, generator
-        self.order, self.place, self.done = order, 0, 0  # done: batches so far
+        self.order, self.place, self.done = order, 0, 0
         self.tested = order[: settings.test_spots]
+        self.plan: list[Round] = []
+        self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
+        self.history: list[dict[str, float]] = []
+        self.losses: list[float] = []
+        self.optimizer: torch.optim.Optimizer | None = None
 
     def copy(self, extension: Extension, seed: int) -> SurfelFit:
         """The same fit to go on with other effects, from copies of the surfels.
@@ -138,24 +220,69 @@ class SurfelFit:
 
     def parts(self) -> dict[str, Any]:
         """All that the fit is made of, for :meth:`of_parts`, which goes on from there to the last digit."""
-        names = ("capture", "grid", "counts", "train", "settings", "reserve", "extension", "order", "place")
-        return {name: getattr(self, name) for name in names} | {
-            "model": dict(self.model.state_dict()),
-            "generator": self.generator.get_state(),
-            "tested": self.tested,
-            "done": self.done,
-        }
+        names = ("capture", "grid", "counts", "train", "settings", "extension")
+        return {name: getattr(self, name) for name in names} | {"state": self.state()}
 
     @classmethod
     def of_parts(cls, parts: dict[str, Any]) -> SurfelFit:
         """The fit that :meth:`parts` took apart."""
-        held = dict(parts)
-        after = {name: held.pop(name) for name in ("place", "tested", "done")}
-        held["model"] = SurfelModel.from_state(held["capture"], held["model"])
-        held["generator"] = torch.Generator().set_state(held["generator"])
-        fit = cls(**held)
-        fit.place, fit.tested, fit.done = after["place"], after["tested"], after["done"]
+        state = parts["state"]
+        held = {name: part for name, part in parts.items() if name != "state"}
+        fit = cls(
+            SurfelModel.from_state(held["capture"], state["model"]),
+            reserve=Seeds(*state["reserve"]),
+            generator=torch.Generator(),
+            order=state["order"],
+            **held,
+        )
+        fit.restore(state)
         return fit
+
+    def state(self) -> dict[str, Any]:
+        """A copy of all that changes while the fit goes on, as tensors, numbers and plain containers."""
+        names = ("order", "place", "tested", "done", "more", "before", "history", "losses")
+        return copy.deepcopy(
+            {name: getattr(self, name) for name in names}
+            | {
+                "model": dict(self.model.state_dict()),
+                "pairs": self.model.pairs,
+                "extension": dict(self.extension.state_dict()),
+                "reserve": tuple(self.reserve),
+                "generator": self.generator.get_state(),
+                "plan": [astuple(each) for each in self.plan],
+                "optimizer": None if self.optimizer is None else _moments(self.optimizer),
+            }
+        )
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Become what :meth:`state` held, on the device of the counts.
+
+        Surfels are other objects from then on, effects keep theirs.
+        """
+        device, state = self.counts.device, copy.deepcopy(state)
+        for name in ("order", "place", "tested", "done", "more", "before", "history", "losses"):
+            setattr(self, name, state[name])
+        self.model = SurfelModel.from_state(self.capture, state["model"])
+        self.extension.load_state_dict(state["extension"])
+        self.reserve, self.generator = Seeds(*state["reserve"]), torch.Generator()
+        self.generator.set_state(state["generator"])
+        self.plan = [Round(*each) for each in state["plan"]]
+        self.optimizer = None
+        self.to(device)
+        self.model.pairs = tuple(part.to(device) for part in state["pairs"])
+        if state["optimizer"] is not None:
+            self.optimizer = self._new_optimizer()
+            for parameter, moments in zip(_parameters(self.optimizer), state["optimizer"], strict=True):
+                if moments:
+                    self.optimizer.state[parameter] = {n: v.to(device) for n, v in moments.items()}
+
+    def to(self, device: torch.device | str) -> None:
+        """Move surfels, effects and counts; between rounds, or before anything has been fitted."""
+        self.model.to(device)
+        self.extension.to(device)
+        self.counts, self.train = self.counts.to(device), self.train.to(device)
+        self.reserve = Seeds(*(part.to(device) for part in self.reserve))
+        self.model.pairs = tuple(part.to(device) for part in self.model.pairs)
 
     @torch.no_grad()
     def match_energy(self) -> None:
@@ -177,12 +304,178 @@ class SurfelFit:
         )
         sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
 
-    def _batch(self) -> Tensor:
+    def schedule(self, plan: Sequence[Round], more: int = 0) -> None:
+        """Say what is to be done next; it takes the place of what was.
+
+        Last rounds are added while the fit is above the noise and gains more than ``WORTH`` a parameter.
+        Bright captures take longer to converge; where the fit is at the noise already, more batches would
+        only fit the noise.
+
+        Args:
+            plan: the rounds.
+            more: last rounds that may be added, at most.
+        """
+        self.plan, self.more, self.before = list(plan), more, math.inf
+        self._add_round()
+
+    def _add_round(self) -> None:
+        if self.plan or not self.more:
+            return
+        deviance, noise = self._deviance()
+        parameters = sum(p.numel() for p in [*self.model.parameters(), *self.extension.parameters()])
+        gained = (self.before - deviance) * self.counts.numel() / 2
+        if deviance > noise and gained >= WORTH * parameters:
+            self.plan = rounds_of(self.settings.steps, 1, settle=False)
+        self.more, self.before = self.more - 1 if self.plan else 0, deviance
+
+    @property
+    def finished(self) -> bool:
+        """Nothing of the plan is left."""
+        return not self.plan
+
+    @property
+    def in_round(self) -> bool:
+        """A round has begun and not ended."""
+        return self.optimizer is not None
+
+    @property
+    def round_done(self) -> bool:
+        """All batches of the present round are done."""
+        return self.in_round and len(self.losses) == self.plan[0].steps
+
+    @property
+    def ahead(self) -> int:
+        """Batches of the plan that are left."""
+        return sum(each.steps for each in self.plan) - len(self.losses)
+
+    def begin_round(self) -> None:
+        """What happens between rounds: shapes, death and growth, who hides whom; a new optimiser."""
+        s, now = self.settings, self.plan[0]
+        if now.shapes:
+            choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
+        if now.grow:
+            prune_and_grow(
+                self.model,
+                self.capture,
+                self.grid,
+                self.reserve,
+                self.counts,
+                self.train,
+                self.tested,
+                s.prune,
+                s.grow,
+                self.extension,
+            )
+        if s.visibility:
+            self.model.update_visibility()
+        self.optimizer = self._new_optimizer()
+
+    def _new_optimizer(self) -> torch.optim.Optimizer:
+        """With the rates of the next batch of the present round."""
+        s, model = self.settings, self.model
+        # The response waits for the places, the tie for the surface: both would otherwise settle around
+        # errors of the seeds.
+        response_rate = s.response_rate * (0.3 if self.plan[0].settling else 1.0)
+        groups = [
+            {"params": [model.raw_depth], "lr": s.depth_rate},
+            {"params": [model.raw_albedo], "lr": s.albedo_rate},
+            {"params": [model.raw_normal], "lr": s.normal_rate},
+            {"params": list(model.laser_sensor.parameters()), "lr": response_rate},
+            {"params": list(self.extension.parameters()), "lr": s.effect_rate},
+        ]
+        kept = [group | {"highest": group["lr"]} for group in groups if group["params"]]
+        optimizer = torch.optim.Adam(kept, betas=(0.9, 0.98))
+        self._set_rates(optimizer)
+        return optimizer
+
+    def _set_rates(self, optimizer: torch.optim.Optimizer) -> None:
+        now, step = self.plan[0], len(self.losses)
+        rate = 1 - 0.7 * step / now.steps
+        if not now.left:
+            rate = max(0.01, 0.5 * (1 + math.cos(math.pi * step / now.steps)))
+        for group in optimizer.param_groups:
+            group["lr"] = group["highest"] * rate
+
+    def next_rows(self) -> Tensor:
+        """Draw the next batch: ``[B]`` rows of the training counts."""
         size = min(self.settings.batch, len(self.train))
         if self.place + size > len(self.order):
             self.order, self.place = torch.randperm(len(self.train), generator=self.generator), 0
         self.place += size
         return self.order[self.place - size : self.place]
+
+    def loss(self, rows: Tensor) -> dict[str, Tensor]:
+        """What a batch minimises, per bin.
+
+        Args:
+            rows: ``[B]`` of the training counts.
+
+        Returns:
+            ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``presence``,
+            ``effects``.
+        """
+        s, model = self.settings, self.model
+        per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
+        tie = s.tie * 0.3 ** max(0, self.plan[0].left - 1) * per_count
+        cost = s.surfel_cost * per_count
+        expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
+        terms = {
+            "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
+            "bending": tie * model.bending(),
+            "presence": cost * model.presence(),
+            "effects": per_count * torch.as_tensor(self.extension.penalty()),
+        }
+        return {"loss": sum(terms.values(), torch.zeros(())), **terms}
+
+    def step(self) -> None:
+        """One batch."""
+        assert self.optimizer is not None  # a round has begun
+        terms = self.loss(self.next_rows())
+        self.optimizer.zero_grad()
+        terms["loss"].backward()
+        self.optimizer.step()
+        self.stepped(terms)
+
+    def stepped(self, terms: dict[str, Tensor]) -> None:
+        """Count a batch whose gradient step has been taken: bounds, rates.
+
+        Args:
+            terms: of the batch, as :meth:`loss` gave them.
+        """
+        assert self.optimizer is not None  # a round has begun
+        self.extension.clamp()
+        self.losses.append(float(terms["counts"].detach()))
+        self.done += 1
+        self._set_rates(self.optimizer)
+
+    def end_round(self) -> None:
+        """Note the round, link neighbours anew, and see whether another follows."""
+        self.model.link()
+        sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
+        loss = float(np.mean(self.losses[-len(self.losses) // 4 :]))
+        self.history.append({"surfels": len(self.model), "loss": loss, **sensor})
+        self.plan, self.losses, self.optimizer = self.plan[1:], [], None
+        self._add_round()
+
+    def finish(self, progress: Progress | None = None) -> list[dict[str, float]]:
+        """Do all that is planned, from wherever the fit is.
+
+        Args:
+            progress: called with (batches done, of how many) since the call.
+
+        Returns:
+            entries of ``history`` that came along.
+        """
+        begun, known = self.done, len(self.history)
+        while not self.finished:
+            if not self.in_round:
+                self.begin_round()
+            self.step()
+            if progress is not None:
+                progress(self.done - begun, self.done - begun + self.ahead)
+            if self.round_done:
+                self.end_round()
+        return self.history[known:]
 
     def run(
         self,
@@ -202,66 +495,19 @@ class SurfelFit:
             settle: the first round comes from seeds, and the response waits for their places.
 
         Returns:
-            one entry a round: surfels, mean loss over its last quarter, response.
+            one entry a round, see ``history``.
         """
-        s, history, begun = self.settings, [], self.done
-        steps = steps or s.steps
-        total = steps * (rounds + 1)
-        for index in range(rounds):
-            if index or grow_first:
-                parts = (
-                    self.model,
-                    self.capture,
-                    self.grid,
-                    self.reserve,
-                    self.counts,
-                    self.train,
-                    self.tested,
-                )
-                prune_and_grow(*parts, s.prune, s.grow, self.extension)
-            if s.visibility:
-                self.model.update_visibility()
-            losses = []
-            for loss in self._round(rounds - 1 - index, index == 0 and settle, steps):
-                losses.append(loss)
-                self.done += 1
-                if progress is not None:
-                    progress(self.done - begun, total)
-            self.model.link()
-            sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
-            history.append(
-                {"surfels": len(self.model), "loss": float(np.mean(losses[-len(losses) // 4 :])), **sensor}
-            )
-        return history
+        self.schedule(rounds_of(steps or self.settings.steps, rounds, settle, grow_first))
+        return self.finish(progress)
 
-    def converge(self, progress: Progress | None = None) -> list[dict[str, float]]:
-        """Last rounds anew, while the fit is above the noise and gains more than ``WORTH`` a parameter.
-
-        Bright captures take longer to converge; where the fit is at the noise already, more batches would
-        only fit the noise.
-
-        Args:
-            progress: goes on from the batches that were done before.
+    def converge(self) -> list[dict[str, float]]:
+        """Last rounds anew while they gain, see :meth:`schedule`.
 
         Returns:
-            one entry a round, ``more`` at most.
+            one entry a round, ``settings.more`` at most.
         """
-
-        def told(done: int, total: int) -> None:
-            if progress is not None:
-                progress(self.done, self.done - done + total)
-
-        history: list[dict[str, float]] = []
-        parameters = sum(p.numel() for p in [*self.model.parameters(), *self.extension.parameters()])
-        bins = self.counts.numel()
-        before, noise = self._deviance()
-        while len(history) < self.settings.more and before > noise:
-            history += self.run(1, told, settle=False)
-            after, noise = self._deviance()
-            if (before - after) * bins / 2 < WORTH * parameters:
-                break
-            before = after
-        return history
+        self.schedule([], self.settings.more)
+        return self.finish()
 
     @torch.no_grad()
     def _deviance(self) -> tuple[float, float]:
@@ -270,39 +516,11 @@ class SurfelFit:
         scores = transient_scores(self.counts[self.tested], expected)
         return scores.deviance_per_bin, scores.deviance_noise
 
-    def _round(self, left: int, settling: bool, steps: int) -> Iterator[float]:
-        s, model = self.settings, self.model
-        last = left == 0
-        steps *= 2 if last else 1
-        # The response waits for the places, the tie for the surface: both would otherwise settle around
-        # errors of the seeds.
-        response_rate = s.response_rate * (0.3 if settling else 1.0)
-        per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
-        tie = s.tie * 0.3 ** max(0, left - 1) * per_count
-        cost = s.surfel_cost * per_count
-        groups = [
-            {"params": [model.raw_depth], "lr": s.depth_rate},
-            {"params": [model.raw_albedo], "lr": s.albedo_rate},
-            {"params": [model.raw_normal], "lr": s.normal_rate},
-            {"params": list(model.laser_sensor.parameters()), "lr": response_rate},
-            {"params": list(self.extension.parameters()), "lr": s.effect_rate},
-        ]
-        optimizer = torch.optim.Adam([g for g in groups if g["params"]], betas=(0.9, 0.98))
 
-        def rate(step: int) -> float:
-            return max(0.01, 0.5 * (1 + math.cos(math.pi * step / steps))) if last else 1 - 0.7 * step / steps
+def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:
+    return [parameter for group in optimizer.param_groups for parameter in group["params"]]
 
-        schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, rate)
-        for _ in range(steps):
-            rows = self._batch()
-            expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
-            fit = (expected - torch.xlogy(self.counts[rows], expected)).mean()
-            loss = (
-                fit + tie * model.bending() + cost * model.presence() + per_count * self.extension.penalty()
-            )
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            self.extension.clamp()
-            schedule.step()
-            yield float(fit.detach())
+
+def _moments(optimizer: torch.optim.Optimizer) -> list[dict[str, Tensor]]:
+    """What an optimiser remembers of each parameter, in order; empty where a parameter has not moved."""
+    return [dict(optimizer.state.get(parameter, {})) for parameter in _parameters(optimizer)]

@@ -20,13 +20,13 @@ from omegaconf import OmegaConf
 from nlos_lit.capture.errors import UserError
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
-from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.instantiate import arguments_of
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTINGS: dict[str, type] = {
     "model": PipelineSettings,
-    "surfels": RefineSettings,
+    "surfels": SurfelSettings,
     "criticism": CriticismSettings,
 }
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own

@@ -25,8 +25,9 @@ from nlos_lit.metrics.geometry import depth_map, geometry_errors
 from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import planes_progress
+from nlos_lit.surfels.fit import SurfelSettings
+from nlos_lit.surfels.fitted import fit_surfels
 from nlos_lit.surfels.model import SurfelModel
-from nlos_lit.surfels.refine import RefineSettings, refine
 from nlos_lit.training.callbacks import History
 from nlos_lit.training.configs import settings_of
 from nlos_lit.training.run_folder import Run
@@ -66,9 +67,9 @@ def refine_run(run: Run, folder: Path) -> dict[str, Any]:
     grid = module.pipeline.phasor.grid
     with torch.no_grad():
         intensity = module.pipeline.phasor().cpu()
-    settings = settings_of(RefineSettings, run.config["surfels"], "surfels")
+    settings = settings_of(SurfelSettings, run.config["surfels"], "surfels")
     with planes_progress("refining surfels") as progress:
-        refined = refine(
+        refined = fit_surfels(
             capture,
             intensity,
             grid,

@@ -24,9 +24,9 @@ from nlos_lit.inference.refit import Comparison, compare, log_likelihood, refit_
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import split_spots
 from nlos_lit.model.build import PipelineSettings
-from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.surfels.fit import SurfelSettings
 
-SURFELS = RefineSettings(surfel_cost=10.0, prune=3.0)  # conf/surfels/criticism.yaml
+SURFELS = SurfelSettings(surfel_cost=10.0, prune=3.0)  # conf/surfels/criticism.yaml
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 A scan is 32 × 32 spots; the time window holds all the light with a margin. Own scenes are rendered by
 `blind_elements`, the others are path-traced renders (expected values with Monte-Carlo noise of a few per cent
-a bin), refined in time by a monotone cubic interpolation of the cumulative light.
+a bin), made finer in time by a monotone cubic interpolation of the cumulative light.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def _render(name: str, plan: Plan) -> Scene:
     kept = np.arange(side * side).reshape(side, side)[:: side // SIDE, :: side // SIDE].ravel()
     laser = capture.laser[kept]
     sensor = laser if capture.confocal else capture.sensor[kept]
-    clean = refine(capture.counts[kept], capture.t_start, capture.bin_length, plan.window.fine)
+    clean = finer(capture.counts[kept], capture.t_start, capture.bin_length, plan.window.fine)
     bounces = None
     every = RENDERS / f"{plan.render.removesuffix('d3')}d8.hdf5"
     if every.exists() and capture.confocal:
@@ -186,11 +186,11 @@ def _render(name: str, plan: Plan) -> Scene:
         smooth = gaussian_filter(more.reshape(SIDE, SIDE, -1), (1.5, 1.5, 6)).reshape(more.shape)
         # No way is shorter than the shortest third bounce.
         late = np.cumsum(capture.counts[kept], axis=1) > 0
-        bounces = refine(np.maximum(smooth, 0) * late, capture.t_start, capture.bin_length, plan.window.fine)
+        bounces = finer(np.maximum(smooth, 0) * late, capture.t_start, capture.bin_length, plan.window.fine)
     return Scene(name, plan.window, laser, sensor, clean, bounces=bounces)
 
 
-def refine(light: np.ndarray, t_start: float, bin_length: float, axis: Axis) -> np.ndarray:
+def finer(light: np.ndarray, t_start: float, bin_length: float, axis: Axis) -> np.ndarray:
     """Light ``[S, T]`` in bins as light on a fine axis ``[S, n]``; nothing is negative, energies stay."""
     edges = t_start + bin_length * np.arange(light.shape[1] + 1)
     total = np.concatenate([np.zeros((len(light), 1)), np.cumsum(light, axis=1, dtype=np.float64)], axis=1)

@@ -6,7 +6,7 @@ import pytest
 from blind_elements import Axis, Elements, fourth_bounce, third_bounce
 from blind_helpers import WINDOW, mean_path, one_dot, points, scene_of, work_on
 from blind_inject import EFFECTS
-from blind_scenes import FINE, PAD, PLANS, Scene, load, refine
+from blind_scenes import FINE, PAD, PLANS, Scene, finer, load
 from conftest import real_file
 
 from data_modules.readers import read_capture
@@ -67,7 +67,7 @@ def test_fourth_bounce_of_one_pair_by_hand():
 
 def test_refining_keeps_each_bin_and_never_goes_below_zero():
     coarse = np.random.default_rng(0).exponential(1.0, (3, 40)) * (np.arange(40) > 11)
-    fine = refine(coarse, 1.0, 0.008, Axis(1.0, 0.001, 320))
+    fine = finer(coarse, 1.0, 0.008, Axis(1.0, 0.001, 320))
     assert fine.min() >= 0
     np.testing.assert_allclose(fine.reshape(3, 40, 8).sum(axis=2), coarse, atol=1e-9)
 

@@ -28,7 +28,7 @@ from nlos_lit.inference.screen import Candidate
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
 from nlos_lit.inference.witness import direct_decays, log_gain, witness
 from nlos_lit.model.build import PipelineSettings
-from nlos_lit.surfels.fit import RefineSettings
+from nlos_lit.surfels.fit import SurfelSettings
 
 SCAN = Scan.of(capture_of(scattered(12)))
 
@@ -264,7 +264,7 @@ def test_wall_profile_is_in_the_world_and_blank_where_no_spots_are(residuals):
 
 
 def test_a_render_is_refused_in_a_sentence():
-    pipeline = BasePipeline({"depth": (0.4, 1.0)}, PipelineSettings(0.1), RefineSettings(), 1 << 30)
+    pipeline = BasePipeline({"depth": (0.4, 1.0)}, PipelineSettings(0.1), SurfelSettings(), 1 << 30)
     scene = dataclasses.replace(capture_of(raster(16)), is_counts=False)
     with pytest.raises(UserError, match="holds expected values"):
         diagnose(scene, pipeline, CriticismSettings(), name="x", seed=0)

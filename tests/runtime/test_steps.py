@@ -22,7 +22,7 @@ from nlos_lit.inference.joint_step import best_start, copy_effects, move_base, s
 from nlos_lit.inference.problem import build_problem, effect_columns
 from nlos_lit.runtime import steps as module
 from nlos_lit.runtime.steps import Steps
-from nlos_lit.surfels.fit import RefineSettings, SurfelFit
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 
 pytestmark = FORWARD_MODE
 
@@ -128,7 +128,7 @@ class Pipeline:
     """Surfels known beforehand, fitted for a few steps."""
 
     def __init__(self, scene):
-        self.model, self.surfels, self.seeds = surfels(scene), RefineSettings(steps=4, test_spots=64), []
+        self.model, self.surfels, self.seeds = surfels(scene), SurfelSettings(steps=4, test_spots=64), []
 
     def image(self, capture):
         return torch.ones(2, 3, 4), None

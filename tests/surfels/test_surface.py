@@ -1,5 +1,5 @@
-"""Refinement of a small scene: at the noise, better than its image, repeatable, blind to held-out counts,
-silent on noise.
+"""The surface fit of a small scene: at the noise, better than its image, repeatable, blind to held-out
+counts, silent on noise.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
+from nlos_lit.surfels.fit import SurfelSettings
+from nlos_lit.surfels.fitted import fit_surfels, score_spots
 from nlos_lit.surfels.growth import Seeds, best_apart, neighbour_candidates, occupied, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel
-from nlos_lit.surfels.refine import RefineSettings, refine, score_spots
 
-QUICK = RefineSettings(
+QUICK = SurfelSettings(
     rounds=3, steps=60, more=0, batch=24, test_spots=200, floor=0.15, per_cell=2, quadrature=2
 )
 BIN = 0.0096
@@ -71,7 +72,7 @@ def fitted():
         held,
         intensity,
         grid,
-        refine(capture, intensity, grid, QUICK, train, seed=0, heldout_spots=np.flatnonzero(held)),
+        fit_surfels(capture, intensity, grid, QUICK, train, seed=0, heldout_spots=np.flatnonzero(held)),
     )
 
 
@@ -112,10 +113,10 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
     changed = dataclasses.replace(capture, counts=counts)
     scored = np.flatnonzero(held)
     first, again = (
-        refine(capture, intensity, grid, short, train, seed=4, heldout_spots=scored) for _ in range(2)
+        fit_surfels(capture, intensity, grid, short, train, seed=4, heldout_spots=scored) for _ in range(2)
     )
-    blind = refine(changed, intensity, grid, short, train, seed=4, heldout_spots=scored)
-    other = refine(capture, intensity, grid, short, train, seed=5)
+    blind = fit_surfels(changed, intensity, grid, short, train, seed=4, heldout_spots=scored)
+    other = fit_surfels(capture, intensity, grid, short, train, seed=5)
     for name, value in first.model.state_dict().items():
         if isinstance(value, torch.Tensor):
             assert torch.equal(value, again.model.state_dict()[name])
@@ -131,7 +132,7 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
     for more in (0, 1, 6):
         settings = dataclasses.replace(short, more=more)
         progress = (lambda *count: seen.append(count)) if more == 1 else None
-        result = refine(capture, intensity, grid, settings, train, progress=progress)
+        result = fit_surfels(capture, intensity, grid, settings, train, progress=progress)
         deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
         rounds.append(len(result.history))
     assert rounds[:2] == [1, 2]
@@ -146,9 +147,9 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
 def test_only_the_given_spots_are_scored(fitted):
     capture, held, intensity, grid, _ = fitted
     short, train = dataclasses.replace(QUICK, rounds=1, steps=2), np.flatnonzero(~held)
-    assert refine(capture, intensity, grid, short, train).heldout is None
+    assert fit_surfels(capture, intensity, grid, short, train).heldout is None
     some = np.flatnonzero(held)[5:25]
-    result = refine(capture, intensity, grid, short, train, heldout_spots=some)
+    result = fit_surfels(capture, intensity, grid, short, train, heldout_spots=some)
     counts, expected = (
         capture.gated_counts()[some].astype(float),
         result.expected(torch.from_numpy(some)).double().numpy(),
@@ -174,7 +175,7 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
     seen, scores = [], {}
     for scan_shapes in (False, True):
         extension = Extension(build_effects(["tcspc_nonlinearity"], Scan.of(rough)))
-        result = refine(
+        result = fit_surfels(
             rough, intensity, grid, settings, train, extension=extension, heldout_spots=np.flatnonzero(held),
             scan_shapes=scan_shapes, progress=lambda done, total: seen.append((done, total)),
         )  # fmt: skip
@@ -209,7 +210,7 @@ def test_progress_counts_every_step(fitted):
     capture, held, intensity, grid, _ = fitted
     seen = []
     settings = dataclasses.replace(QUICK, rounds=2, steps=3)
-    refine(
+    fit_surfels(
         capture,
         intensity,
         grid,
@@ -227,7 +228,7 @@ def test_noise_alone_seeds_nothing(fitted, ambient):
     empty = dataclasses.replace(capture, counts=noise)
     intensity, grid = image(empty)
     with pytest.raises(UserError, match="significant"):
-        refine(empty, intensity, grid, QUICK, np.flatnonzero(~held))
+        fit_surfels(empty, intensity, grid, QUICK, np.flatnonzero(~held))
 
 
 def test_high_ambient_light_seeds_few_and_finds_the_scene(fitted):
@@ -235,7 +236,7 @@ def test_high_ambient_light_seeds_few_and_finds_the_scene(fitted):
     bright = capture.counts + np.random.default_rng(1).poisson(12.0, capture.counts.shape).astype(np.uint16)
     capture = dataclasses.replace(capture, counts=bright)
     intensity, grid = image(capture)
-    result = refine(
+    result = fit_surfels(
         capture, intensity, grid, QUICK, np.flatnonzero(~held), heldout_spots=np.flatnonzero(held)
     )
     assert len(result.model) < 2 * len(clean.model)
@@ -279,8 +280,8 @@ def test_candidates_keep_apart():
 def test_impossible_input_is_refused(fitted):
     capture, held, intensity, grid, _ = fitted
     with pytest.raises(UserError, match="its grid"):
-        refine(capture, intensity[1:], grid, QUICK, np.flatnonzero(~held))
+        fit_surfels(capture, intensity[1:], grid, QUICK, np.flatnonzero(~held))
     with pytest.raises(UserError, match="at least 1"):
-        RefineSettings(rounds=0)
+        SurfelSettings(rounds=0)
     with pytest.raises(UserError, match="floor"):
-        RefineSettings(floor=1.5)
+        SurfelSettings(floor=1.5)

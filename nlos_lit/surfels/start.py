@@ -1,0 +1,114 @@
+"""Where the surfels of a scene begin: at the significant maxima of the phasor image."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.effects.extension import Extension
+from nlos_lit.model.laser_sensor import LaserSensor
+from nlos_lit.runtime.memory import check_machine
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings, plan_from_seeds
+from nlos_lit.surfels.growth import rank_one, score, start_response, volume_maxima
+from nlos_lit.surfels.model import Lateral, SurfelModel
+
+BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
+RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
+
+
+def seed_surfels(
+    capture: Capture,
+    intensity: Tensor,
+    grid: VolumeGrid,
+    settings: SurfelSettings,
+    train_spots: np.ndarray,
+    laser_sensor_start: LaserSensor | None = None,
+    extension: Extension | None = None,
+    seed: int = 0,
+    scan_shapes: bool = False,
+) -> SurfelFit:
+    """Surfels at the significant maxima of an image, with a response that matches the energy.
+
+    Args:
+        capture: raw counts and scan.
+        intensity: ``[nz, nx, ny]`` phasor image on ``grid``.
+        grid: of the image.
+        settings: of the fit.
+        train_spots: ``[N]`` rows of the capture.
+        laser_sensor_start: start values of the response; None takes 1.2 bins and 0.7 per bin.
+        extension: physical effects fitted along with the surfels, in place.
+        seed: of batches and tested spots.
+        scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
+            them, instead of where they are; costs one round more.
+
+    Returns:
+        a fit with all its rounds ahead.
+
+    Raises:
+        UserError: shapes disagree, or no place of the image is significant in the counts.
+        MemoryBudgetError: a step does not fit the free memory.
+    """
+    if tuple(intensity.shape) != tuple(grid.shape):
+        raise UserError(
+            f"the image has shape {tuple(intensity.shape)}, its grid {tuple(grid.shape)}; "
+            "give the grid it was imaged on"
+        )
+    s, extension = settings, Extension([]) if extension is None else extension
+    intensity = intensity.detach().cpu().float()
+    train = torch.as_tensor(np.asarray(train_spots), dtype=torch.long)
+    first, last = capture.gate
+    counts = torch.from_numpy(capture.counts[train.numpy(), first:last].astype(np.float32))
+    if counts.sum() == 0:
+        raise UserError(
+            "the training spots hold no counts inside the gate; check the gate and the held-out spots"
+        )
+    widest, bins = max(abs(p) for p in grid.pitch[:2]), capture.bin_length
+    subdivide = s.subdivide or (2 if widest > 6 * bins else 1)
+    points = s.quadrature or int(np.clip(math.ceil(widest / subdivide * 0.55 / bins), 1, 8))
+    dx, dy = (p / subdivide for p in grid.pitch[:2])
+    x, y = (o - (subdivide - 1) / 2 * p for o, p in zip(grid.origin[:2], (dx, dy), strict=True))
+    lateral = Lateral((x, y), (dx, dy), (grid.shape[1] * subdivide, grid.shape[2] * subdivide))
+    sensor = start_response(capture, counts, laser_sensor_start)
+    generator = torch.Generator().manual_seed(seed)
+    order = torch.randperm(len(train), generator=generator)
+    tested = order[: s.test_spots]
+    candidates, value = volume_maxima(intensity, grid, RESERVE * s.floor, s.per_cell, lateral)
+    null = rank_one(counts)[tested]
+    scores = score(candidates, capture, lateral.pitch, 1, sensor, counts[tested], null, train[tested])
+    significance = scores.significance * math.sqrt(len(train) / len(tested))
+    keep = (significance > s.significance) & (value >= s.floor)
+    if int(keep.sum()) > s.max_seeds:
+        keep &= significance >= significance.topk(s.max_seeds).values[-1]
+    if not keep.any():
+        raise UserError(
+            f"none of the image's {len(value)} maxima is significant in the counts: the capture may hold "
+            "only noise, or scene.volume.depth or the gate misses the hidden scene "
+            "(surfels.significance sets the level)"
+        )
+    best = significance.topk(min(s.max_seeds, len(significance))).indices
+    seeds = candidates.take(keep)
+    step_bytes = int(keep.sum()) * points**2 * min(s.batch, len(train)) * BYTES_PER_PATH
+    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
+    check_machine(step_bytes + 8 * counts.numel(), "one step of the surface fit", smaller)
+    model = SurfelModel(
+        capture,
+        centre=seeds.centre,
+        normal=seeds.normal,
+        albedo=value[keep] / value[keep].mean(),
+        lateral=lateral,
+        laser_sensor=sensor,
+        quadrature=points,
+    )
+    fit = SurfelFit(
+        model, capture, grid, counts, train, s, candidates.take(best), extension, generator, order
+    )
+    fit.match_energy()
+    scan_shapes = scan_shapes and any(effect.shapes for effect in extension.effects)
+    fit.schedule(plan_from_seeds(s, scan_shapes), s.more)
+    return fit

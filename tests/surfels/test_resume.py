@@ -1,0 +1,122 @@
+"""A surface fit that is stopped anywhere goes on to the digits of the one that was not."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, surfels
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.effects.extension import Extension
+from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, plan_from_seeds, rounds_of
+from nlos_lit.surfels.growth import Seeds
+
+pytestmark = FORWARD_MODE
+SETTINGS = SurfelSettings(rounds=2, steps=4, more=2, batch=24, test_spots=50, quadrature=1)
+
+
+def begun() -> SurfelFit:
+    """Surfels a bin too deep, a tail to be found, and a plan with every kind of round."""
+    scene = capture_of(raster(8))
+    scan, model = Scan.of(scene), surfels(scene, level=10.0)
+    scene = drawn(model, Extension([effect_of("irf_tail", scan, fraction=0.3, decay=0.1)]), scene)
+    with torch.no_grad():
+        model.raw_depth.add_(1.0)
+    fit = fit_of(model, scene, Extension([effect_of(n, scan) for n in ("irf_tail", "wall_reflectance")]))
+    fit.settings, fit.tested = SETTINGS, fit.order[:50]
+    fit.grid = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
+    fit.reserve = Seeds(torch.tensor([[0.0, 0.0, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    fit.schedule(plan_from_seeds(SETTINGS, scan_shapes=True), SETTINGS.more)
+    return fit
+
+
+def through_a_file(fit: SurfelFit, path: Path) -> SurfelFit:
+    """Another fit, from the file that this one's state leaves."""
+    torch.save(fit.state(), path)
+    again = begun()
+    again.run(1, steps=3)  # it was elsewhere before
+    again.restore(torch.load(path, weights_only=True))
+    return again
+
+
+def same(first: object, second: object) -> bool:
+    if torch.is_tensor(first):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(v, second[k]) for k, v in first.items())
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(map(same, first, second))
+    return first == second
+
+
+def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_path):
+    straight, stopped, moments = begun(), begun(), 0
+    straight.finish()
+    assert straight.history[0]["surfels"] == 12
+    assert len(straight.history) > 2  # rounds were added
+    while not stopped.finished:
+        stopped = through_a_file(stopped, tmp_path / "state.pt")
+        if not stopped.in_round:
+            stopped.begin_round()
+            stopped = through_a_file(stopped, tmp_path / "state.pt")
+        stopped.step()
+        stopped = through_a_file(stopped, tmp_path / "state.pt")
+        assert stopped.in_round
+        moments += 1
+        if stopped.round_done:
+            stopped.end_round()
+    assert moments == straight.done
+    assert same(stopped.state(), straight.state())
+
+
+def test_a_state_is_a_copy():
+    fit = begun()
+    fit.begin_round()
+    fit.step()
+    kept = fit.state()
+    before = copy.deepcopy(kept)
+    fit.finish()
+    assert same(kept, before)
+    assert not same(kept["model"], fit.state()["model"])
+    other = begun()
+    other.restore(kept)
+    other.finish()
+    assert same(kept, before)
+
+
+def test_rates_fall_within_a_round_and_the_last_cools_down():
+    fit = begun()
+    fit.schedule(rounds_of(4, 2, settle=True))
+    rates = []
+    while not fit.finished:
+        if not fit.in_round:
+            fit.begin_round()
+        rates.append([group["lr"] for group in fit.optimizer.param_groups])
+        fit.step()
+        if fit.round_done:
+            fit.end_round()
+    first, last = np.array(rates[:4]), np.array(rates[4:])
+    highest = [0.15, 0.08, 0.03, 0.03, 0.1]
+    slow = [1, 1, 1, 0.3, 1]  # the response waits
+    assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, np.multiply(highest, slow)))
+    assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
+
+
+def test_a_plan_is_the_rounds_in_order():
+    settings = dataclasses.replace(SETTINGS, rounds=3, steps=10)
+    assert plan_from_seeds(settings, scan_shapes=False) == [
+        Round(10, left=2, settling=True),
+        Round(10, left=1, grow=True),
+        Round(20, grow=True),
+    ]
+    assert plan_from_seeds(settings, scan_shapes=True) == [
+        Round(20, settling=True),
+        Round(10, left=1, grow=True, shapes=True),
+        Round(20, grow=True),
+    ]
