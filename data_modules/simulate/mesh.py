@@ -89,6 +89,11 @@ class Mesh:
         """Total area, m²."""
         return float(np.linalg.norm(self.face_vectors, axis=1).sum())
 
+    @property
+    def volume(self) -> float:
+        """Volume inside a closed mesh, m³, by the divergence theorem; negative where normals point inside."""
+        return float((self.corners.mean(axis=1) * self.face_vectors).sum() / 3)
+
     def moved(self, offset: tuple[float, float, float]) -> Mesh:
         """The same mesh shifted by ``offset``, m."""
         return Mesh(self.vertices + np.asarray(offset), self.faces, self.albedo)
