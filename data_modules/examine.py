@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from data_modules.readers import READERS
-from data_modules.readers.assemble import direct_pulse, smooth
+from data_modules.readers.assemble import counted, direct_pulse, smooth
 from nlos_lit.capture import Capture
 
 
@@ -16,8 +16,8 @@ class Findings:
     """What the counts say.
 
     Args:
-        mean: ``[T]`` transient, counts a bin, over all spots.
-        totals: ``[S]`` counts inside the gate.
+        mean: ``[T]`` transient, counts a bin, over the spots that recorded it; NaN where none did.
+        totals: ``[S]`` counts inside the gate; NaN where the spot recorded none of its bins.
         pulse: bin of the direct pulse's peak; None where there is none before the gate.
         pulse_share: of all counts, before the gate; 0 without a pulse.
         first_returns: ``[K]`` depth of the first return, half the path, m, of the spots that have one.
@@ -35,12 +35,16 @@ class Findings:
 def examine(capture: Capture) -> Findings:
     """Direct pulse, depth of the first returns, and what looks wrong."""
     first, last = capture.gate
-    mean = capture.counts.mean(axis=0, dtype=np.float64)
+    mean = capture.mean_transient()
     totals = capture.counts[:, first:last].sum(axis=1, dtype=np.float64)
-    pulse = direct_pulse(mean, capture.bin_length, capture.t_start) if first > 0 else None
-    share = float(mean[:first].sum() / mean.sum()) if pulse is not None else 0.0
+    observed = capture.gated_observed()
+    if observed is not None:
+        totals[~observed.any(axis=1)] = np.nan
+    known = np.nan_to_num(mean)
+    pulse = direct_pulse(known, capture.bin_length, capture.t_start) if first > 0 else None
+    share = float(known[:first].sum() / known.sum()) if pulse is not None else 0.0
     returns = _first_returns(capture)
-    return Findings(mean, totals, pulse, share, returns, tuple(_warnings(capture, mean, totals, returns)))
+    return Findings(mean, totals, pulse, share, returns, tuple(_warnings(capture, known, totals, returns)))
 
 
 def describe(capture: Capture, fmt: str, findings: Findings) -> str:
@@ -76,6 +80,7 @@ def describe(capture: Capture, fmt: str, findings: Findings) -> str:
         f"depth {near / 2:.4g} to {far / 2:.4g} m",
         f"counts       a spot, all bins: {_three(per_spot)}; "
         f"in the gate: {_three(findings.totals)} (least, median, most)",
+        f"recorded     {_recorded(capture)}",
     ]
     if capture.exposure_s is not None:
         lines.append(f"exposure     {capture.exposure_s:g} s a spot")
@@ -115,16 +120,21 @@ def _first_returns(capture: Capture) -> np.ndarray:
     """
     first, last = capture.gate
     width = max(1, min(round(0.024 / capture.bin_length), last - first))
+    observed = capture.gated_observed()
     found = []
-    for transient in capture.counts[:: max(1, capture.n_spots // 1024), first:last]:
-        level = smooth(transient, width)
+    for spot in range(0, capture.n_spots, max(1, capture.n_spots // 1024)):
+        # Where bins were not recorded, their edges are no returns.
+        bins = np.arange(last - first) if observed is None else np.flatnonzero(observed[spot])
+        if len(bins) == 0:
+            continue
+        level = smooth(capture.counts[spot, first + bins], width)
         floor = float(np.percentile(level, 10))
         peak = int(np.argmax(level))
         height = level[peak] - floor
         noise = np.sqrt(max(floor, 1 / width) / width) if capture.is_counts else 0.0
         below = np.flatnonzero(level[:peak] - floor < 0.2 * height)
         if height > 6 * noise and len(below):
-            found.append(int(below[-1]) + 1)
+            found.append(bins[int(below[-1]) + 1])
     return (capture.t_start + (first + np.asarray(found, dtype=np.float64) + 0.5) * capture.bin_length) / 2
 
 
@@ -160,6 +170,9 @@ def _warnings(capture: Capture, mean: np.ndarray, totals: np.ndarray, returns: n
         told.append(f"the wall is {extent:.3g} m across; check wall_size")
     if capture.bin_width_ps > 500 or capture.bin_width_ps < 0.5:
         told.append(f"bins of {capture.bin_width_ps:.3g} ps are unusual; check bin_width_ps")
+    if capture.is_counts and not counted(capture.counts):
+        told.append("the values are taken as photon counts but are not whole numbers; check counts")
+    totals = totals[np.isfinite(totals)]
     empty = int((totals == 0).sum())
     if empty:
         told.append(f"{empty} of {capture.n_spots} spots hold no counts in the gate")
@@ -178,15 +191,19 @@ def _warnings(capture: Capture, mean: np.ndarray, totals: np.ndarray, returns: n
             f"only bins {first + filled[0]} to {first + filled[-1]} of the gate hold counts; "
             "the rest may be cropped, not dark"
         )
-    if capture.is_counts:
-        begins = np.argmax(capture.counts[:, first:last] > 0, axis=1)[totals > 0]
-        busy = np.median(totals) > 20 * (last - first)
-        if busy and len(begins) and np.ptp(begins) > 0.2 * (last - first):
-            told.append(
-                "some spots hold nothing in the first part of the gate where others do: "
-                "cropped there, not dark"
-            )
     return told
+
+
+def _recorded(capture: Capture) -> str:
+    """Which of the gate's bins were recorded, in words."""
+    observed = capture.gated_observed()
+    if observed is None:
+        return "every bin of the gate"
+    part, none = int((~observed.all(axis=1)).sum()), int((~observed.any(axis=1)).sum())
+    return (
+        f"{observed.mean():.1%} of the gate's bins; {none} of {capture.n_spots} spots have none of them, "
+        f"{part - none} only some"
+    )
 
 
 def _spacing(capture: Capture) -> str:
@@ -199,4 +216,5 @@ def _spacing(capture: Capture) -> str:
 
 
 def _three(values: np.ndarray) -> str:
+    values = values[np.isfinite(values)]
     return f"{values.min():.4g} / {np.median(values):.4g} / {values.max():.4g}"

@@ -58,17 +58,23 @@ def heldout_mask(capture: Capture, block: int, every: int) -> np.ndarray:
 
 
 class SpotDataset(Dataset):
-    """Item ``[s, …]`` is the batch of those spots: their numbers and gated counts ``[S, T]`` as float32."""
+    """Item ``[s, …]`` is the batch of those spots: their numbers and gated counts ``[S, T]`` as float32.
+
+    ``observed`` ``[S, T]`` bool is with them where not all of the capture's gated bins were recorded.
+    """
 
     def __init__(self, capture: Capture) -> None:
         self.counts = torch.from_numpy(capture.gated_counts())
+        observed = capture.gated_observed()
+        self.observed = None if observed is None else torch.from_numpy(observed)
 
     def __len__(self) -> int:
         return len(self.counts)
 
     def __getitem__(self, spots: list[int]) -> dict[str, torch.Tensor]:
         index = torch.tensor(spots)
-        return {"spots": index, "counts": self.counts[index]}
+        batch = {"spots": index, "counts": self.counts[index]}
+        return batch if self.observed is None else batch | {"observed": self.observed[index]}
 
 
 class SpotSchedule(Sampler[list[int]]):
@@ -154,8 +160,8 @@ class CaptureDataModule(L.LightningDataModule):
         self.capture, self.batch, self.seed = capture, batch, seed
         self.dataset = SpotDataset(capture)
         held = heldout_mask(capture, block, every)
-        # A spot without a single gated count was not measured (figure 4 has a hole of 100): it says nothing
-        # about a model.
+        # A spot without a single gated count says nothing about a model: it was not recorded, as the reader
+        # may have found (figure 4 has a hole of 100), or it is dead.
         measured = self.dataset.counts.sum(1).numpy() > 0
         if not measured.all():
             empty = int((~measured).sum())

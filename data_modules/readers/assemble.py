@@ -2,16 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from data_modules.readers.options import ReaderOptions
+from data_modules.readers.unrecorded import find_unrecorded
 from nlos_lit.capture import SPEED_OF_LIGHT, Capture
 from nlos_lit.capture.errors import CaptureError
 
-COMMON_OPTIONS = frozenset({"t_start", "gate", "flip_x", "flip_y", "swap_xy", "scan_order", "exposure_s"})
+COMMON_OPTIONS = frozenset(
+    {
+        "t_start",
+        "gate",
+        "flip_x",
+        "flip_y",
+        "swap_xy",
+        "scan_order",
+        "exposure_s",
+        "counts",
+        "observed",
+    }
+)
+log = logging.getLogger(__name__)
 DIRECT_PULSE_PATH = 0.3  # m; a pulse later than this is not the wall's own return
 USUAL_GATE_PATH = 0.72  # m; the 600 bins of 4 ps that the LCT's authors cut
 TAIL_FRACTION = 1e-4  # of the direct pulse's peak, where its tail is taken to have ended
@@ -36,6 +51,9 @@ def assemble(
     exposure_s: float | None = None,
     scan_order: np.ndarray | None = None,
     listed: np.ndarray | None = None,
+    observed: np.ndarray | None = None,
+    find_observed: bool = True,
+    cropped: bool = False,
     steps: list[str] | None = None,
     facts: dict[str, Any] | None = None,
 ) -> Capture:
@@ -59,6 +77,10 @@ def assemble(
         exposure_s: exposure per spot, s, where the file says it.
         scan_order: ``[S]`` rank of each spot, where the file says it.
         listed: ``[S]`` for a file that lists its spots: the row of that list which each spot comes from.
+        observed: ``[S, T]`` bool, the bins that were recorded, where the file says it.
+        find_observed: look for bins that were not recorded (:func:`find_unrecorded`), where the values are
+            counts and the user does not say otherwise.
+        cropped: the format cuts bins off that are empty in every spot.
         steps: what was done to the data, for the provenance.
         facts: further provenance.
 
@@ -88,6 +110,19 @@ def assemble(
     elif behind_pulse:
         gate, told = gate_after_direct_pulse(counts, bin_length, t_start)
         steps.append(told)
+    if is_counts is None:
+        is_counts = counted(counts)
+    if options.counts is not None:
+        is_counts = options.counts
+        steps.append(f"values are {'photon counts' if is_counts else 'expected values'} as asked")
+    if options.observed is not None:
+        observed = None
+        steps.append("every bin was recorded, as asked")
+    elif find_observed and is_counts:
+        observed, found = find_unrecorded(counts, cropped)
+        steps += found
+        for told in found:
+            log.info("%s: %s", path.name, told)
     rank = acquisition_order(options.scan_order, shape if listed is None else None, spots)
     if rank is None:
         rank = scan_order if scan_order is not None else listed
@@ -99,6 +134,7 @@ def assemble(
         if not np.array_equal(order.ravel(), np.arange(spots)):
             rank = (np.arange(spots) if rank is None else _permutation(rank, spots))[order.ravel()]
             counts = counts[order.ravel()]
+            observed = None if observed is None else observed[order.ravel()]
             vectors = [vector[order.ravel()] for vector in vectors]
             steps.append("spots ordered by x, then y")
     laser, sensor, laser_normal, sensor_normal = vectors
@@ -114,8 +150,9 @@ def assemble(
         scan_shape=shape,
         scan_order=rank,
         exposure_s=options.exposure_s if options.exposure_s is not None else exposure_s,
-        is_counts=counted(counts) if is_counts is None else is_counts,
+        is_counts=is_counts,
         provenance={"source": str(path), "format": fmt, **(facts or {}), "steps": steps},
+        observed=observed,
     )
 
 

@@ -78,6 +78,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         shape=shape,
         gate=gate,
         listed=order,
+        cropped=True,
         steps=[f"bins of {width:g} ps, wall coordinates × {scale[0]:g} m, × {scale[1]:g} m, centred", *told],
     )
 
@@ -114,17 +115,9 @@ def _world(
 
 
 def _kept_bins(counts: np.ndarray) -> tuple[tuple[int, int] | None, list[str]]:
-    """First to last bin with any counts, and what else is cut, in words."""
+    """First to last bin with any counts, and that in words."""
     filled = np.flatnonzero(counts.any(axis=0))
     if len(filled) == 0:
         return None, []
     gate = (int(filled[0]), int(filled[-1]) + 1)
-    told = [f"bins {gate[0]} to {gate[1] - 1} hold counts and are the gate unless another is given"]
-    seen = counts.any(axis=1)
-    if not seen.all():
-        told.append(f"{int((~seen).sum())} of {len(counts)} spots hold no counts at all")
-    begins = np.argmax(counts > 0, axis=1)[seen]
-    late = begins > gate[0] + 0.1 * (gate[1] - gate[0])
-    if late.any():
-        told.append(f"{int(late.sum())} spots hold nothing before bin {int(begins[late].min())}")
-    return gate, told
+    return gate, [f"bins {gate[0]} to {gate[1] - 1} hold counts and are the gate unless another is given"]

@@ -29,6 +29,9 @@ class ReaderOptions:
             spot's rank in the file's order.
         exposure_s: exposure per spot, s.
         raw_scale: whether a y-tal file carries the factor π·cosθ_l/d_l² of an unmodified ``tal render``.
+        counts: whether the values are photon counts (Poisson distributed), or expected values.
+        observed: ``all`` where every zero is a measurement, so that no bin is taken for one that was not
+            recorded.
 
     Raises:
         CaptureError: a value cannot be what it stands for.
@@ -44,6 +47,8 @@ class ReaderOptions:
     scan_order: str | np.ndarray | None = None
     exposure_s: float | None = None
     raw_scale: bool | None = None
+    counts: bool | None = None
+    observed: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("bin_width_ps", "exposure_s"):
@@ -55,6 +60,14 @@ class ReaderOptions:
             _positive("wall_size", side)
         if self.t_start is not None and not (isinstance(self.t_start, Real) and math.isfinite(self.t_start)):
             raise CaptureError(f"t_start must be a path length in metres; found {self.t_start!r}")
+        for name in ("flip_x", "flip_y", "swap_xy", "raw_scale", "counts"):
+            if not isinstance(getattr(self, name), bool | None):
+                raise CaptureError(f"{name} must be true or false; found {getattr(self, name)!r}")
+        if self.observed not in (None, "all"):
+            raise CaptureError(
+                "observed must be all (every zero is a measurement), or be left out so that bins which were "
+                f"not recorded are looked for; found {self.observed!r}"
+            )
         if self.gate is not None:
             if (
                 not isinstance(self.gate, Sequence)

@@ -15,14 +15,14 @@ from data_modules.readers.assemble import COMMON_OPTIONS, assemble, remove_delay
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.frame import device_distances, wall_rotation
 from data_modules.readers.options import ReaderOptions
-from data_modules.readers.ytal_write import T_LI_SI, T_LX_LY_SX_SY, T_SI, T_SX_SY, own_facts
+from data_modules.readers.ytal_write import OBSERVED, T_LI_SI, T_LX_LY_SX_SY, T_SI, T_SX_SY, own_facts
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
 NAME = "ytal"
 DESCRIPTION = (
     "y-tal .hdf5, any scan: bin length and wall points (m) from the file, "
-    "expected values unless written by this project"
+    "whole numbers are counts, others expected values"
 )
 EXPECTS = "H, delta_t, sensor_grid_xyz and laser_grid_xyz"
 OPTIONS = COMMON_OPTIONS | {"raw_scale"}
@@ -48,7 +48,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         options: what the user says, out of OPTIONS.
 
     Returns:
-        the capture; of expected values, unless this project wrote the file.
+        the capture; of counts where all values are whole numbers, unless the user or this project's own facts
+        say otherwise.
 
     Raises:
         CaptureError: an array is missing or damaged, shapes do not fit H_format, or facts that a correction
@@ -73,7 +74,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         "bin_length": length,
     }
     if ours is not None:
-        return _own(path, options, ours, counts, geometry, t_start)
+        return _own(path, options, ours, counts, geometry, t_start, _observed(contents))
     steps: list[str] = []
     devices = {name: _device(contents, name) for name in ("laser_xyz", "sensor_xyz")}
     if contents.ndim("t_accounts_first_and_last_bounces") >= 0 and contents.scalar(
@@ -110,7 +111,6 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         counts=counts,
         t_start=t_start,
         shape=shape if shape is not None and len(shape) > 1 else None,
-        is_counts=False,
         steps=steps,
         facts=facts,
         **geometry,
@@ -124,6 +124,7 @@ def _own(
     counts: np.ndarray,
     geometry: dict[str, Any],
     t_start: float,
+    observed: np.ndarray | None,
 ) -> Capture:
     """What `write_capture` wrote, exactly as it was, then the options."""
     if options.raw_scale is not None:
@@ -136,12 +137,36 @@ def _own(
         "counts": counts.astype(ours.pop("dtype")),
         "t_start": t_start,
         "gate": ours.pop("gate"),
+        "observed": observed,
     }
     if not options.given:
         return Capture(**fields, **ours, provenance=provenance)
     shape = ours.pop("scan_shape")
     steps = provenance.pop("steps", [])
-    return assemble(path, NAME, options, **fields, **ours, shape=shape, steps=steps, facts=provenance)
+    return assemble(
+        path,
+        NAME,
+        options,
+        **fields,
+        **ours,
+        shape=shape,
+        find_observed=False,
+        steps=steps,
+        facts=provenance,
+    )
+
+
+def _observed(contents: Contents) -> np.ndarray | None:
+    """``[S, T]`` what `write_capture` wrote beside H; None where every bin was recorded."""
+    if OBSERVED not in contents:
+        return None
+    values = contents.read(OBSERVED)
+    if values.shape != contents.entries["H"].shape or not np.isin(values, (0, 1)).all():
+        raise CaptureError(
+            f"{OBSERVED} in {contents.path.name} must be 0 or 1 for each value of H "
+            f"{contents.entries['H'].shape}; found shape {values.shape}"
+        )
+    return np.ascontiguousarray(values.reshape(len(values), -1).T.astype(bool))
 
 
 def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] | None, np.ndarray]:

@@ -19,6 +19,7 @@ from nlos_lit.capture.errors import CaptureError
 
 T_SX_SY, T_LX_LY_SX_SY, T_SI, T_LI_SI = 1, 2, 3, 4  # H_format
 N_3, X_Y_3 = 1, 2  # *_grid_format
+OBSERVED = "nlos_lit_observed"  # not a key of y-tal, which tal refuses: only where bins were not recorded
 _OURS = "nlos_lit: "  # one line of YAML whose value is JSON, so that no YAML parser is needed to read it back
 _COUNT_TYPES = {
     np.dtype(kind).name
@@ -32,7 +33,8 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
 
     H is float32 as tal expects, so whole counts must not exceed 2²⁴ where they are odd. Scans are stored as
     T_Sx_Sy (confocal and one laser point), T_Lx_Ly_Sx_Sy (exhaustive, and one sensor point as a 1 × 1 sensor
-    grid), T_Li_Si (irregular, every laser with every sensor point) or T_Si (irregular pairs). The file
+    grid), T_Li_Si (irregular, every laser with every sensor point) or T_Si (irregular pairs). Which bins were
+    recorded is an array of its own beside H, only where some were not: tal cannot read such a file. The file
     appears under its name only when complete.
 
     Args:
@@ -67,6 +69,8 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
         "scene_info": _OURS + _facts(capture) + "\n",
         "volume_format": h5py.Empty(np.float64),
     }
+    if capture.observed is not None:
+        items[OBSERVED] = np.ascontiguousarray(capture.observed.T, dtype=np.uint8).reshape(items["H"].shape)
     for name, rows, points, normals in (
         ("laser", laser, capture.laser, capture.laser_normal),
         ("sensor", sensor, capture.sensor, capture.sensor_normal),
@@ -196,10 +200,9 @@ def _write(path: Path, items: dict[str, Any]) -> None:
     try:
         with h5py.File(partial, "w") as file:
             for name, value in items.items():
-                packed = (
-                    {"compression": "gzip", "compression_opts": 4, "shuffle": True} if name == "H" else {}
-                )
-                file.create_dataset(name, data=value, **packed)
+                packed = name in ("H", OBSERVED)
+                options = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if packed else {}
+                file.create_dataset(name, data=value, **options)
         os.chmod(partial, 0o644)
         os.replace(partial, path)
     except OSError as error:

@@ -62,10 +62,12 @@ class Capture:
             True.
         provenance: where the data came from and what was done to it, JSON-serialisable; ``steps`` lists the
             changes.
+        observed: ``[S, T]`` bool, True where a bin of a spot was recorded; its counts are measurements there,
+            zeros included. None means everywhere. Elsewhere ``counts`` are zero and say nothing.
 
     Raises:
-        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, or the gate
-            is empty.
+        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, the gate is
+            empty or none of its bins was recorded, or counts lie in bins that were not recorded.
 
     Examples:
         A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:
@@ -100,6 +102,7 @@ class Capture:
     exposure_s: float | None = None
     is_counts: bool = True
     provenance: dict[str, Any] = field(default_factory=dict)
+    observed: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         if self.counts.ndim != 2 or 0 in self.counts.shape:
@@ -132,6 +135,8 @@ class Capture:
                 f"give 0 <= first < last <= {bins}"
             )
         object.__setattr__(self, "gate", (first, last))
+        if self.observed is not None:
+            _check_observed(self.observed, self.counts, (first, last))
         if self.scan_shape is not None:
             shape = tuple(int(n) for n in self.scan_shape)
             if len(shape) not in (2, 4) or int(np.prod(shape)) != spots:
@@ -189,6 +194,47 @@ class Capture:
         first, last = self.gate
         return self.counts[:, first:last].astype(np.float32)
 
+    def gated_observed(self) -> np.ndarray | None:
+        """``[S, last - first]`` bool, which bins inside the gate were recorded; None where all were."""
+        if self.observed is None:
+            return None
+        inside = self.observed[:, self.gate[0] : self.gate[1]]
+        return None if inside.all() else inside
+
+    def mean_transient(self) -> np.ndarray:
+        """``[T]`` float64 counts a bin, on average over the spots that recorded it; NaN where none did.
+
+        Examples:
+            >>> import numpy as np
+            >>> two, up = np.zeros((2, 3)), np.tile([0.0, 0.0, 1.0], (2, 1))
+            >>> seen = np.array([[True, True, False], [True, False, False]])
+            >>> counts = np.array([[2, 3, 0], [6, 0, 0]])
+            >>> Capture(counts, two, two, up, up, 0.1, observed=seen).mean_transient().tolist()
+            [4.0, 3.0, nan]
+        """
+        if self.observed is None:
+            return self.counts.mean(axis=0, dtype=np.float64)
+        spots = self.observed.sum(axis=0)
+        total = self.counts.sum(axis=0, dtype=np.float64)
+        return np.divide(total, spots, out=np.full(self.n_bins, np.nan), where=spots > 0)
+
+    def with_counts(self, counts: np.ndarray, **changes: Any) -> Capture:
+        """The same scan with other counts, such as drawn ones; what was not recorded stays zero.
+
+        Args:
+            counts: ``[S, T]``; those in bins that were not recorded are left out.
+            changes: further fields that change, by name.
+
+        Returns:
+            A capture that shares this one's geometry and the bins that were recorded.
+
+        Raises:
+            CaptureError: as for any capture.
+        """
+        if self.observed is not None:
+            counts = np.where(self.observed, counts, np.zeros((), dtype=counts.dtype))
+        return dataclasses.replace(self, counts=counts, **changes)
+
     def with_gate(self, first: int | None = None, last: int | None = None) -> Capture:
         """The same counts with another gate.
 
@@ -208,7 +254,8 @@ class Capture:
     def sum_bins(self, factor: int) -> Capture:
         """Every ``factor`` neighbouring bins summed into one; a rest at the end is dropped.
 
-        The gate shrinks to whole new bins, so that nothing from outside it comes in.
+        The gate shrinks to whole new bins, so that nothing from outside it comes in. A sum was recorded where
+        all its parts were; the counts of others are left out.
 
         Raises:
             CaptureError: ``factor`` is not between 1 and the number of bins, or no whole new bin lies inside
@@ -228,17 +275,31 @@ class Capture:
         if not 1 <= factor <= self.n_bins:
             raise CaptureError(f"cannot sum {factor} bins of {self.n_bins} into one")
         bins = self.n_bins // factor
+
+        def parts(values: np.ndarray) -> np.ndarray:
+            return values[:, : bins * factor].reshape(self.n_spots, bins, factor)
+
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
-        summed = self.counts[:, : bins * factor].reshape(self.n_spots, bins, factor).sum(axis=2, dtype=wide)
+        summed, observed = parts(self.counts).sum(axis=2, dtype=wide), self.observed
+        if observed is not None:
+            observed = parts(observed).all(axis=2)
+            summed[~observed] = 0
         gate = (-(-self.gate[0] // factor), min(self.gate[1] // factor, bins))
         step = f"summed {factor} bins into one"
-        return self._changed(step, counts=_narrow(summed), bin_length=self.bin_length * factor, gate=gate)
+        return self._changed(
+            step,
+            counts=_narrow(summed),
+            bin_length=self.bin_length * factor,
+            gate=gate,
+            observed=observed,
+        )
 
     def sum_spots(self, factor: int) -> Capture:
         """Every ``factor × factor`` neighbouring spots of a scanned grid summed into one.
 
         A sum lies at the mean of its spots' wall points and normals; rows and columns left over at the end
-        are dropped.
+        are dropped. A bin of a sum was recorded where it was at all its spots; the counts of others are left
+        out.
 
         Raises:
             CaptureError: there is no single scanned grid, or ``factor`` is not between 1 and the grid's
@@ -262,6 +323,10 @@ class Capture:
 
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
         counts = blocks(self.counts).sum(axis=(1, 3), dtype=wide).reshape(nx * ny, -1)
+        observed = self.observed
+        if observed is not None:
+            observed = blocks(observed).all(axis=(1, 3)).reshape(nx * ny, -1)
+            counts[~observed] = 0
         means = {
             name: blocks(getattr(self, name)).mean(axis=(1, 3)).reshape(nx * ny, 3)
             for name in ("laser", "sensor", "laser_normal", "sensor_normal")
@@ -273,6 +338,7 @@ class Capture:
             counts=_narrow(counts),
             scan_shape=(nx, ny),
             scan_order=order,
+            observed=observed,
             **means,
         )
 
@@ -299,6 +365,25 @@ def _check_counts(counts: np.ndarray) -> None:
         )
     if counts.max() == 0:
         raise CaptureError("every count is zero; there is nothing to reconstruct")
+
+
+def _check_observed(observed: np.ndarray, counts: np.ndarray, gate: tuple[int, int]) -> None:
+    if observed.shape != counts.shape or observed.dtype != np.bool_:
+        raise CaptureError(
+            f"observed must be {list(counts.shape)} of True and False, as the counts; "
+            f"found shape {observed.shape} of {observed.dtype}"
+        )
+    lost = np.count_nonzero(counts[~observed])
+    if lost:
+        raise CaptureError(
+            f"{lost} bins hold counts but are said not to have been recorded; "
+            "mark them as observed or set them to zero"
+        )
+    if not observed[:, gate[0] : gate[1]].any():
+        raise CaptureError(
+            f"no bin of the gate [{gate[0]}, {gate[1]}) was recorded; choose another gate, or "
+            "scene.reader.observed=all where the zeros are measurements"
+        )
 
 
 def _narrow(counts: np.ndarray) -> np.ndarray:

@@ -68,8 +68,8 @@ class Scan:
         high = torch.stack([p[:, :2].amax(0) for p in moving]).amax(0)
         half = float((high - low).max()) / 2 or 1.0
         first, last = capture.gate
-        kept = capture.counts[:, :last]
-        mean = kept[:, first:].mean(axis=0, dtype=np.float64)
+        kept = capture.mean_transient()[:last]
+        mean = kept[first:]
         return Scan(
             places=tuple((p[:, :2] - (low + high) / 2) / half for p in moving),
             half=half,
@@ -81,6 +81,6 @@ class Scan:
             t_start=capture.t_start,
             n_bins=last,
             gate=capture.gate,
-            mean_counts=float(kept.sum(dtype=np.float64) / capture.n_spots),
-            background=max(quietest_level(torch.from_numpy(mean)), 1e-3 * float(mean.mean())),
+            mean_counts=float(np.nansum(kept)),
+            background=max(quietest_level(torch.from_numpy(mean)), 1e-3 * float(np.nanmean(mean))),
         )

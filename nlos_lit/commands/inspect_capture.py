@@ -57,5 +57,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--raw-scale", action=argparse.BooleanOptionalAction, help="the file carries tal's raw scale, or not"
     )
+    parser.add_argument(
+        "--counts", action=argparse.BooleanOptionalAction, help="the values are photon counts, or not"
+    )
+    parser.add_argument(
+        "--observed", choices=("all",), help="all: every zero is a measurement, look for no unrecorded bins"
+    )
     parser.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="where the picture goes")
     return parser

@@ -6,22 +6,30 @@ import torch
 from torch import Tensor
 
 
-def transient_loss(measured: Tensor, rendered: Tensor) -> Tensor:
+def transient_loss(measured: Tensor, rendered: Tensor, observed: Tensor | None = None) -> Tensor:
     """E_H, paper Eq. 12: mean squared error over all elements, ``Σ(H - H_R)²/(S·T)``.
 
     Args:
         measured: ``[S, T]`` transients H, over the counts that count as 1.
         rendered: ``[S, T]`` transients H_R, over the same.
+        observed: ``[S, T]`` bool, the elements that were recorded; the mean is over them. None: all.
 
     Returns:
-        A scalar.
+        A scalar; 0 where nothing was recorded.
 
     Examples:
         >>> import torch
         >>> transient_loss(torch.tensor([[1.0, 2.0]]), torch.tensor([[1.0, 0.0]]))
         tensor(2.)
+        >>> recorded = torch.tensor([[False, True]])
+        >>> transient_loss(torch.tensor([[0.0, 2.0]]), torch.tensor([[4.0, 0.0]]), recorded)
+        tensor(4.)
     """
-    return ((measured - rendered) ** 2).mean()
+    square = (measured - rendered) ** 2
+    if observed is None:
+        return square.mean()
+    # A sum with zeros, not a selection: its size does not depend on the data.
+    return (square * observed).sum() / observed.sum().clamp_min(1)
 
 
 def sparsity(intensity: Tensor) -> Tensor:

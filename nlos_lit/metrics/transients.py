@@ -26,16 +26,25 @@ class Scores:
     nmse_noise_floor: float
 
 
-def transient_scores(counts: Tensor, expected: Tensor) -> Scores:
+def transient_scores(counts: Tensor, expected: Tensor, observed: Tensor | None = None) -> Scores:
     """All scores of rendered transients.
 
     Args:
         counts: ``[S, T]`` measured photon counts.
         expected: ``[S, T]`` rendered counts, positive where ``counts`` are.
+        observed: ``[S, T]`` bool, the bins that were recorded; the others are left out. None: all.
 
     Returns:
         scores with their noise levels.
+
+    Examples:
+        >>> import torch
+        >>> seen = torch.tensor([True, True, False])
+        >>> transient_scores(torch.tensor([3.0, 4.0, 0.0]), torch.tensor([3.0, 3.0, 7.0]), seen).nmse
+        0.04
     """
+    if observed is not None:
+        counts, expected = counts[observed], expected[observed]
     return Scores(
         deviance_per_bin=poisson_deviance(counts, expected).mean().item(),
         deviance_noise=expected_deviance(expected).item(),
@@ -121,7 +130,7 @@ def expected_deviance(expected: Tensor, terms: int = 60) -> Tensor:
     mu = torch.exp(torch.linspace(math.log(1e-6), math.log(20.0), 2000, dtype=torch.float64))
     k = torch.arange(terms, dtype=torch.float64)[:, None]
     weight = torch.exp(k * mu.log() - mu - torch.lgamma(k + 1))
-    table = 2 * (weight * (torch.xlogy(k, k) - k * mu.log())).sum(0)
+    table = (2 * (weight * (torch.xlogy(k, k) - k * mu.log())).sum(0)).to(expected.device)
     value = expected.double().clamp_min(1e-6)
     place = (value.clamp_max(20.0).log() - math.log(1e-6)) / (math.log(20.0) - math.log(1e-6)) * (len(mu) - 1)
     low = place.floor().long().clamp(0, len(mu) - 2)

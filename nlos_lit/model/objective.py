@@ -37,14 +37,17 @@ class Objective(NamedTuple):
         Args:
             pipeline: the simulated measurement.
             spots: ``[S]`` rows of the capture.
-            counts: ``[S, T]`` their gated counts.
+            counts: ``[S, T]`` their gated counts; bins that the capture did not record are left out.
             step: number of the iteration; chooses the batch of voxels.
 
         Returns:
             ``transient``, ``sparsity``, ``albedo`` and their sum ``loss``, scalars.
         """
         rendering = pipeline(spots)
-        terms = {"transient": transient_loss(counts / self.scale, rendering.expected / self.scale)}
+        data = transient_loss(
+            counts / self.scale, rendering.expected / self.scale, pipeline.observed_at(spots)
+        )
+        terms = {"transient": data}
         terms |= self.regularisation(rendering.intensity, self.voxel_batch(rendering.albedo, step))
         terms["loss"] = terms["transient"] + terms["sparsity"] + terms["albedo"]
         return terms

@@ -31,7 +31,8 @@ class Pipeline(nn.Module):
     """Phasor imaging, implicit geometry, transient rendering and laser-sensor response of one capture.
 
     Args:
-        capture: gives the wall points, their normals and the gate; its counts are not kept.
+        capture: gives the wall points, their normals, the gate and which bins were recorded; its counts are
+            not kept.
         phasor: H → I_pf; :meth:`~nlos_lit.model.phasor.PhasorImaging.prepare` must have been called before
             the first forward pass.
         geometry: I_pf → G.
@@ -44,6 +45,7 @@ class Pipeline(nn.Module):
     sensor: Tensor
     laser_normal: Tensor
     sensor_normal: Tensor
+    observed: Tensor | None
 
     def __init__(
         self,
@@ -64,6 +66,15 @@ class Pipeline(nn.Module):
             self.register_buffer(
                 name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False
             )
+
+        observed = capture.gated_observed()
+        self.register_buffer(
+            "observed", None if observed is None else torch.from_numpy(observed.copy()), persistent=False
+        )
+
+    def observed_at(self, spots: Tensor) -> Tensor | None:
+        """``[S, T_gate]`` bool, which gated bins of some spots were recorded; None where all of them were."""
+        return None if self.observed is None else self.observed[spots]
 
     def forward(self, spots: Tensor) -> Rendering:
         """Simulate the measurement of some spots.

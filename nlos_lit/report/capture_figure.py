@@ -9,6 +9,8 @@ import numpy as np
 
 from nlos_lit.capture import Capture
 
+NOT_RECORDED = "0.7"  # grey
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import PathCollection
@@ -19,10 +21,12 @@ if TYPE_CHECKING:
 def draw_capture(capture: Capture, mean_transient: np.ndarray, totals: np.ndarray, path: Path) -> None:
     """One picture: mean transient with gate, counts over the wall, three spots, one time slice.
 
+    What was not recorded is a gap in the curves and grey on the wall.
+
     Args:
         capture: as read.
-        mean_transient: ``[T]`` counts a bin, mean over the spots.
-        totals: ``[S]`` counts inside the gate.
+        mean_transient: ``[T]`` counts a bin, mean over the spots; NaN where no spot recorded it.
+        totals: ``[S]`` counts inside the gate; NaN where the spot recorded none of its bins.
         path: PNG file to write.
     """
     import matplotlib
@@ -33,23 +37,26 @@ def draw_capture(capture: Capture, mean_transient: np.ndarray, totals: np.ndarra
     first, last = capture.gate
     way = capture.t_start + (np.arange(capture.n_bins) + 0.5) * capture.bin_length
     figure, ((mean, wall), (samples, slice_)) = plt.subplots(2, 2, figsize=(12, 9), layout="constrained")
+    counts = capture.counts
+    if capture.observed is not None:
+        counts = np.where(capture.observed, counts, np.nan)
     mean.semilogy(way, np.where(mean_transient > 0, mean_transient, np.nan), lw=0.8, color="k")
     mean.axvspan(*capture.path_gate, color="tab:green", alpha=0.15, label="gate")
     mean.set(title="mean transient", xlabel="path (m)", ylabel="counts a bin")
     mean.legend()
     _on_wall(figure, wall, capture, totals, "counts in the gate, wall seen from its own side")
-    ranked = np.argsort(totals, kind="stable")
+    ranked = np.argsort(totals, kind="stable")[: np.count_nonzero(np.isfinite(totals))]
     for share, name in ((0.05, "weak"), (0.5, "median"), (0.95, "strong")):
-        spot = ranked[int(share * (capture.n_spots - 1))]
-        samples.plot(way[first:last], capture.counts[spot, first:last], lw=0.6, label=f"{name} spot {spot}")
+        spot = ranked[int(share * (len(ranked) - 1))]
+        samples.plot(way[first:last], counts[spot, first:last], lw=0.6, label=f"{name} spot {spot}")
     samples.set(title="three spots, gated", xlabel="path (m)", ylabel="counts a bin")
     samples.legend()
-    peak = first + int(np.argmax(mean_transient[first:last]))
+    peak = first + int(np.nanargmax(mean_transient[first:last]))
     _on_wall(
         figure,
         slice_,
         capture,
-        capture.counts[:, peak].astype(np.float64),
+        counts[:, peak].astype(np.float64),
         f"bin {peak}, path {way[peak]:.3f} m",
     )
     figure.savefig(path, dpi=110)
@@ -82,4 +89,5 @@ def _on_wall(figure: Figure, axes: Axes, capture: Capture, values: np.ndarray, t
         axes.set_aspect("equal")
         axes.invert_xaxis()
     figure.colorbar(image, ax=axes)
+    axes.set_facecolor(NOT_RECORDED)
     axes.set(title=title, xlabel="x (m)", ylabel="y (m)")

@@ -231,8 +231,11 @@ def transients_plot(
     path: np.ndarray,
     labels: Sequence[str],
     band: tuple[np.ndarray, np.ndarray] | None = None,
+    observed: np.ndarray | None = None,
 ) -> Figure:
     """Measured against rendered transients, one panel a spot.
+
+    What was not recorded is a gap in the measured curve, shaded grey.
 
     Args:
         measured: ``[K, T]`` counts a bin.
@@ -241,6 +244,7 @@ def transients_plot(
         labels: K names of the spots.
         band: (low, high), each ``[K, T]``, shaded: the range that the rendered transient and counting
             statistics allow.
+        observed: ``[K, T]`` bool, the bins that were recorded; None for all.
 
     Returns:
         a figure of K panels in one column (K < 3) or two.
@@ -253,7 +257,13 @@ def transients_plot(
         if k >= len(measured):
             axes.set_axis_off()
             continue
-        axes.plot(path, measured[k], color=BLACK, linewidth=0.8, drawstyle="steps-mid", label="measured")
+        seen = measured[k] if observed is None else np.where(observed[k], measured[k], np.nan)
+        axes.plot(path, seen, color=BLACK, linewidth=0.8, drawstyle="steps-mid", label="measured")
+        if observed is not None and not observed[k].all():
+            axes.fill_between(
+                path, 0, 1, where=~observed[k], transform=axes.get_xaxis_transform(), color=NOTHING,
+                alpha=0.5, linewidth=0, step="mid",
+            )  # fmt: skip
         axes.plot(path, rendered[k], color=RED, label="rendered")
         if band is not None:
             axes.fill_between(

@@ -79,4 +79,4 @@ def test_the_page_on_own_data_works(tmp_path, monkeypatch):
         np.testing.assert_array_equal(capture.counts[5 * 32 + 7], names["counts"][5, 7])
         np.testing.assert_allclose(capture.laser[5 * 32 + 7, :2], (names["x"][5], names["y"][7]), rtol=1e-12)
         assert capture.bin_width_ps == pytest.approx(16.0)
-    assert (plain.is_counts, own.is_counts, own.gate, own.exposure_s) == (False, True, (150, 512), 0.1)
+    assert (plain.is_counts, own.is_counts, own.gate, own.exposure_s) == (True, True, (150, 512), 0.1)
