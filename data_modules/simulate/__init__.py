@@ -1,6 +1,6 @@
 """Ground truth by simulation; shares no code with the renderer that is fitted."""
 
-from data_modules.simulate.bodies import BODIES, Body, assemble, bodies_from
+from data_modules.simulate.bodies import BODIES, Body, assemble, bodies_from, one_line
 from data_modules.simulate.capture import simulate_capture
 from data_modules.simulate.draw import DrawnScene, draw_scene
 from data_modules.simulate.mesh import Mesh, join, load_mesh
@@ -28,6 +28,7 @@ __all__ = [
     "letters",
     "load_mesh",
     "load_truth",
+    "one_line",
     "save_truth",
     "simulate_capture",
     "simulate_transients",

@@ -453,6 +453,25 @@ def bodies_from(configs: Iterable[object]) -> tuple[Body, ...]:
     return tuple(body_from(config, f"body {i}") for i, config in enumerate(configs, 1))
 
 
+def one_line(bodies: Iterable[Body]) -> str:
+    """Bodies as one argument of ``simulate.py``.
+
+    Examples:
+        >>> one_line((Sphere(radius=0.2, albedo=(0.2, 0.9), texture="halves"), Text(text="NO")))
+        "bodies=[{kind: sphere, albedo: [0.2, 0.9], texture: halves, radius: 0.2}, {kind: text, text: 'NO'}]"
+    """
+
+    def told(key: str, value: object) -> str:
+        if isinstance(value, list):
+            return f"[{', '.join(f'{number:.10g}' for number in value)}]"
+        if isinstance(value, str):
+            return repr(value) if key == "text" else value
+        return f"{value:.10g}"
+
+    pairs = [", ".join(f"{k}: {told(k, v)}" for k, v in body.config().items()) for body in bodies]
+    return f"bodies=[{', '.join(f'{{{line}}}' for line in pairs)}]"
+
+
 def assemble(bodies: Iterable[Body]) -> Mesh:
     """Bodies as one mesh; they may hide, touch and enter one another."""
     return join(*(body.mesh() for body in bodies))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from data_modules.simulate.bodies import (
     Text,
     Torus,
     assemble,
+    one_line,
 )
 from data_modules.simulate.capture import simulate_capture
 from data_modules.simulate.mesh import Mesh, join
@@ -28,6 +30,7 @@ from data_modules.simulate.sensor import SensorModel
 from data_modules.simulate.truth import Truth
 from data_modules.simulate.visibility import Occluder
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 
 WALL = 1.0  # edge of the scanned wall, m
 NEAR, FAR = 0.35, 1.05  # between them lies every body, m
@@ -61,7 +64,7 @@ class DrawnScene:
 
     def line(self) -> str:
         """The bodies as one argument of ``simulate.py``."""
-        return line(self.bodies)
+        return one_line(self.bodies)
 
     def measure(self, detail: float = 0.5) -> tuple[Capture, Truth]:
         """Photon counts and what is really there, as of `simulate_capture`, in a few seconds.
@@ -73,28 +76,6 @@ class DrawnScene:
             the capture, and the truth.
         """
         return simulate_capture(self.mesh(), self.scan, self.sensor, self.seed, detail=detail)
-
-
-def line(bodies: tuple[Body, ...]) -> str:
-    """Bodies as one argument of ``simulate.py``.
-
-    Examples:
-        >>> line((Sphere(radius=0.2), Text(text="NO")))
-        "bodies=[{kind: sphere, radius: 0.2}, {kind: text, text: 'NO'}]"
-    """
-
-    def value(v: object) -> str:
-        return f"[{', '.join(f'{n:g}' for n in v)}]" if isinstance(v, list) else _scalar(v)
-
-    bodies_told = (
-        "{" + ", ".join(f"{k}: {value(v) if k != 'kind' else v}" for k, v in body.config().items()) + "}"
-        for body in bodies
-    )
-    return f"bodies=[{', '.join(bodies_told)}]"
-
-
-def _scalar(value: object) -> str:
-    return repr(value) if isinstance(value, str) else f"{value:g}"
 
 
 def draw_scene(seed: int, spots: int | None = None) -> DrawnScene:
@@ -139,26 +120,24 @@ def draw_bodies(rng: np.random.Generator, number: int) -> tuple[Body, ...]:
         the bodies.
 
     Raises:
-        RuntimeError: no room was found for one of them.
+        UserError: no room was found for one of them.
     """
     bodies: list[Body] = []
     meshes: list[Mesh] = []
     for _ in range(TRIES):
-        if len(bodies) == number:
-            return tuple(bodies)
-        body = draw_body(rng)
-        body = _placed(rng, body, bodies, meshes)
+        body = _placed(rng, draw_body(rng), bodies, meshes)
         mesh = body.mesh()
         if _inside(mesh) and _apart(mesh, meshes) and shares_seen([*meshes, mesh]).min() > SEEN:
             bodies.append(body)
             meshes.append(mesh)
-    raise RuntimeError(f"found room for {len(bodies)} of {number} bodies in {TRIES} tries; take another seed")
+        if len(bodies) == number:
+            return tuple(bodies)
+    raise UserError(f"found room for {len(bodies)} of {number} bodies in {TRIES} tries; take another seed")
 
 
 def draw_body(rng: np.random.Generator) -> Body:
     """A body of random kind, size, turn and texture."""
-    make = rng.choice(np.array(DRAWS, dtype=object))
-    return make(rng, _texture(rng))
+    return DRAWS[int(rng.integers(len(DRAWS)))](rng, _texture(rng))
 
 
 def _digits(value: float) -> float:
@@ -170,16 +149,17 @@ def _between(rng: np.random.Generator, low: float, high: float) -> float:
     return _digits(rng.uniform(low, high))
 
 
-def _texture(rng: np.random.Generator) -> dict:
+def _texture(rng: np.random.Generator) -> dict[str, Any]:
     kind = str(rng.choice(["plain", "plain", "gradient", "halves", "stripes", "checker"]))
-    bright, dark = _between(rng, 0.5, 1.0), _between(rng, 0.15, 0.5)
-    return {
-        "cell": CELL,
-        "texture": kind,
-        "albedo": bright if kind == "plain" else (dark, bright),
-        "along": str(rng.choice(["x", "y"])),
-        "period": _between(rng, 0.08, 0.2),
-    }
+    dark, bright = _between(rng, 0.15, 0.5), _between(rng, 0.5, 1.0)
+    if kind == "plain":
+        return {"cell": CELL, "albedo": bright}
+    texture = {"cell": CELL, "texture": kind, "albedo": (dark, bright)}
+    if kind in ("stripes", "checker"):
+        texture["period"] = _between(rng, 0.08, 0.2)
+    if kind != "checker":
+        texture["along"] = str(rng.choice(["x", "y"]))
+    return texture
 
 
 def _any_turn(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -194,41 +174,41 @@ def _facing(rng: np.random.Generator, about_z: float) -> tuple[float, float, flo
     )
 
 
-def _sphere(rng: np.random.Generator, texture: dict) -> Body:
+def _sphere(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Sphere(radius=_between(rng, 0.06, 0.16), turn=_any_turn(rng), **texture)
 
 
-def _capsule(rng: np.random.Generator, texture: dict) -> Body:
+def _capsule(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Capsule(
         radius=_between(rng, 0.04, 0.09), length=_between(rng, 0.1, 0.3), turn=_any_turn(rng), **texture
     )
 
 
-def _cylinder(rng: np.random.Generator, texture: dict) -> Body:
+def _cylinder(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Cylinder(
         radius=_between(rng, 0.05, 0.12), height=_between(rng, 0.12, 0.36), turn=_any_turn(rng), **texture
     )
 
 
-def _cone(rng: np.random.Generator, texture: dict) -> Body:
+def _cone(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     radius = _between(rng, 0.08, 0.16)
     top = float(rng.choice([0.0, _digits(radius / 2)]))
     return Cone(radius=radius, top=top, height=_between(rng, 0.14, 0.34), turn=_any_turn(rng), **texture)
 
 
-def _torus(rng: np.random.Generator, texture: dict) -> Body:
+def _torus(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Torus(
         radius=_between(rng, 0.09, 0.16), tube=_between(rng, 0.025, 0.05), turn=_facing(rng, 180), **texture
     )
 
 
-def _plate(rng: np.random.Generator, texture: dict) -> Body:
+def _plate(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Plate(
         width=_between(rng, 0.15, 0.4), height=_between(rng, 0.15, 0.4), turn=_facing(rng, 180), **texture
     )
 
 
-def _fold(rng: np.random.Generator, texture: dict) -> Body:
+def _fold(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Fold(
         width=_between(rng, 0.25, 0.55),
         height=_between(rng, 0.15, 0.4),
@@ -239,7 +219,7 @@ def _fold(rng: np.random.Generator, texture: dict) -> Body:
     )
 
 
-def _bend(rng: np.random.Generator, texture: dict) -> Body:
+def _bend(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Bend(
         width=_between(rng, 0.25, 0.5),
         height=_between(rng, 0.15, 0.4),
@@ -249,7 +229,7 @@ def _bend(rng: np.random.Generator, texture: dict) -> Body:
     )
 
 
-def _text(rng: np.random.Generator, texture: dict) -> Body:
+def _text(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     word = "".join(rng.choice(list(LETTERS), int(rng.integers(1, 4))))
     return Text(
         text=word,
@@ -260,7 +240,7 @@ def _text(rng: np.random.Generator, texture: dict) -> Body:
     )
 
 
-def _person(rng: np.random.Generator, texture: dict) -> Body:
+def _person(rng: np.random.Generator, texture: dict[str, Any]) -> Body:
     return Person(
         height=_between(rng, 0.4, 0.75),
         arms=_between(rng, 10, 150),
@@ -270,7 +250,7 @@ def _person(rng: np.random.Generator, texture: dict) -> Body:
     )
 
 
-DRAWS: tuple[Callable[[np.random.Generator, dict], Body], ...] = (
+DRAWS: tuple[Callable[[np.random.Generator, dict[str, Any]], Body], ...] = (
     _sphere,
     _capsule,
     _cylinder,

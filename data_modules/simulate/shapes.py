@@ -201,7 +201,8 @@ def pen(lines: Sequence[np.ndarray], width: float, cell: float) -> Mesh:
     Args:
         lines: polylines ``[N, 2]`` of (x, y), m; one of a single point is a dot.
         width: of the pen, m.
-        cell: edge of the grid from which the shape is cut, m; its outline is exact to the square of it.
+        cell: edge of the grid from which the shape is cut, m; its outline is exact to the square of
+            it, save at inner corners.
 
     Returns:
         a sheet in the plane z = 0.
@@ -336,7 +337,7 @@ def person(height: float, arms: float, stride: float, cell: float) -> Mesh:
     hip, shoulder, head = -0.03 * h, 0.28 * h, 0.42 * h
     parts = [
         lathe(capsule_profile(0.08 * h, 0.0, cell), cell).moved((0.0, head, 0.0)),
-        limb((0, hip + 0.02 * h, 0), (0, shoulder - 0.04 * h, 0), 0.095 * h, cell),
+        limb((0, hip + 0.02 * h, 0), (0, shoulder - 0.03 * h, 0), 0.095 * h, cell),
         limb((-0.11 * h, shoulder, 0), (0.11 * h, shoulder, 0), 0.055 * h, cell),
     ]
     for side in (-1, 1):

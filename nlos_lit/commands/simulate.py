@@ -3,26 +3,40 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
-from omegaconf import OmegaConf
+import yaml
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from data_modules.readers import write_capture
 from data_modules.simulate import (
+    BODIES,
     SCENES,
+    Body,
     Mesh,
     ScanPlan,
     SensorModel,
+    assemble,
+    bodies_from,
     bunny_two_albedo,
+    draw_scene,
     load_mesh,
+    one_line,
     save_truth,
     simulate_capture,
 )
 from nlos_lit.capture.errors import UserError
 from nlos_lit.effects import EFFECTS
 from nlos_lit.surfels.measure import measure
+
+SCENE_HELP = (
+    f"scene is one of {', '.join(SCENES)}, mesh (with mesh=FILE) or two_albedo (with mesh=FILE); or give "
+    f"bodies=[{{kind: sphere, radius: 0.1, at: [0, 0, 0.6]}}, …], kinds {', '.join(b.kind for b in BODIES)}; "
+    "or random=SEED"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +45,8 @@ class Options:
 
     Args:
         scene: a procedural scene, or what is made of ``mesh``.
+        bodies: bodies that make up the scene instead, each KEY: VALUE pairs.
+        random: seed of a scene drawn at random, with its scan and sensor.
         mesh: file of the scenes ``mesh`` and ``two_albedo``.
         out: the capture's file; must be given.
         overwrite: it may be there already.
@@ -42,6 +58,8 @@ class Options:
     """
 
     scene: str = "default"
+    bodies: tuple[Any, ...] = ()
+    random: int | None = None
     mesh: str | None = None
     out: str | None = None
     overwrite: bool = False
@@ -54,10 +72,15 @@ class Options:
     def __post_init__(self) -> None:
         if not 0 < self.exposure < float("inf"):
             raise UserError(f"exposure must be above 0; found {self.exposure}")
+        given = {"scene": self.scene != "default", "bodies": self.bodies, "random": self.random is not None}
+        named = [name for name, is_given in given.items() if is_given]
+        if len(named) > 1:
+            raise UserError(f"found {' and '.join(named)}; each is a whole scene, so give one of them")
+        if self.mesh is not None and named != ["scene"]:
+            raise UserError(f"found mesh={self.mesh} without scene=mesh or scene=two_albedo; {SCENE_HELP}")
 
 
 SECTIONS = (Options, ScanPlan, SensorModel)
-SCENE_HELP = f"scene is one of {', '.join(SCENES)}, mesh (with mesh=FILE) or two_albedo (with mesh=FILE)"
 
 
 def strengths(arguments: list[str]) -> dict[str, float]:
@@ -76,6 +99,8 @@ def strengths(arguments: list[str]) -> dict[str, float]:
 def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
     """Options, scan and sensor from ``key=value`` arguments, each for the section that has that key.
 
+    With ``random=SEED`` what is not given of the scan and the sensor is as drawn.
+
     Raises:
         UserError: a key that no section has, or a value of the wrong type.
 
@@ -88,8 +113,9 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
     names = [{field.name: field.default for field in dataclasses.fields(section)} for section in SECTIONS]
     keys = ", ".join(f"{key}={value}" for section in names for key, value in section.items())
     given = dict(argument.partition("=")[::2] for argument in arguments)
-    if "effects" in given and not given["effects"].startswith("["):
-        given["effects"] = f"[{given['effects']}]"
+    for key in {"effects", "bodies"} & set(given):
+        if not given[key].startswith("["):
+            given[key] = f"[{given[key]}]"
     for key in given:
         if not any(key in section for section in names):
             raise UserError(
@@ -97,38 +123,48 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
                 f"{SCENE_HELP}\n"
                 f"effects are {', '.join(EFFECTS.names)}, their strengths EFFECT.PARAMETER=VALUE"
             )
+    options = cast(Options, _filled(Options, given))
+    drawn = None if options.random is None else draw_scene(options.random)
+    scan = cast(ScanPlan, _filled(drawn.scan if drawn else ScanPlan, given))
+    return options, scan, cast(SensorModel, _filled(drawn.sensor if drawn else SensorModel, given))
+
+
+def _filled(section: object, given: Mapping[str, str]) -> object:
+    """A section with those of the given values that are its own."""
+    own = {field.name for field in dataclasses.fields(cast(Any, section))} & set(given)
     try:
-        merged = (
-            OmegaConf.merge(
-                section, OmegaConf.from_dotlist([f"{key}={given[key]}" for key in given if key in own])
-            )
-            for section, own in zip(map(OmegaConf.structured, SECTIONS), names, strict=True)
-        )
-        options, scan, sensor = map(OmegaConf.to_object, merged)
+        values = [_read(key, given[key]) for key in given if key in own]
+        return OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(section), *values))
     except OmegaConfBaseException as error:
         raise UserError(
             f"cannot use {error.full_key}={given.get(error.full_key or '')}: {str(error).splitlines()[0]}"
         ) from error
-    return cast(Options, options), cast(ScanPlan, scan), cast(SensorModel, sensor)
 
 
-def build(scene: str, mesh: str | None) -> Mesh:
+def _read(key: str, value: str) -> DictConfig:
+    try:
+        return OmegaConf.from_dotlist([f"{key}={value}"])
+    except yaml.YAMLError as error:
+        raise UserError(f"cannot read {key}={value}: brackets, braces or quotes do not match") from error
+
+
+def build(options: Options) -> tuple[Mesh, tuple[Body, ...]]:
     """The hidden scene that the options name.
 
-    Args:
-        scene: a procedural scene, ``mesh`` or ``two_albedo``.
-        mesh: file of the latter two; None for the others.
-
     Returns:
-        The scene.
+        the scene, and the bodies it is made of, where it is.
 
     Raises:
-        UserError: there is no such scene, or no file where one is needed.
+        UserError: there is no such scene or body, or no file where one is needed.
     """
+    if options.bodies or options.random is not None:
+        bodies = bodies_from(options.bodies) if options.random is None else draw_scene(options.random).bodies
+        return assemble(bodies), bodies
+    scene, mesh = options.scene, options.mesh
     if scene in SCENES and mesh is None:
-        return SCENES[scene]()
+        return SCENES[scene](), ()
     if scene in ("mesh", "two_albedo") and mesh is not None:
-        return load_mesh(mesh) if scene == "mesh" else bunny_two_albedo(mesh)
+        return load_mesh(mesh) if scene == "mesh" else bunny_two_albedo(mesh), ()
     raise UserError(f"found scene={scene} mesh={mesh}; {SCENE_HELP}")
 
 
@@ -166,7 +202,9 @@ def simulate(arguments: list[str]) -> None:
     for file in (out, truth_file):
         if file.exists() and not options.overwrite:
             raise UserError(f"{file} is already there; take another name or say overwrite=true")
-    mesh = build(options.scene, options.mesh)
+    mesh, bodies = build(options)
+    if options.random is not None:
+        print(one_line(bodies))
     sensor = exposed(sensor, options.exposure)
     how: dict[str, Any] = {"two_sided": options.two_sided, "detail": options.detail, "progress": True}
     if options.effects:
@@ -175,7 +213,8 @@ def simulate(arguments: list[str]) -> None:
         )
     else:
         capture, truth = simulate_capture(mesh, scan, sensor, options.seed, **how)
-    capture = dataclasses.replace(capture, provenance={**capture.provenance, "exposure": options.exposure})
+    told = {"exposure": options.exposure} | ({"bodies": [body.config() for body in bodies]} if bodies else {})
+    capture = dataclasses.replace(capture, provenance=capture.provenance | told)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_capture(out, capture, overwrite=options.overwrite)
     save_truth(truth_file, truth)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from data_modules.readers import read_capture
-from data_modules.simulate import load_truth
+from data_modules.simulate import draw_scene, load_truth
 from nlos_lit.capture.errors import UserError
-from nlos_lit.commands.simulate import build, parse, simulate
+from nlos_lit.commands.simulate import Options, build, parse, simulate
 from nlos_lit.runtime.command_line import sentence_errors
 
 main = sentence_errors(simulate)  # as the door does it
@@ -103,7 +103,63 @@ def test_arguments_that_make_no_sense_are_explained(arguments, words):
         parse(arguments)
 
 
-@pytest.mark.parametrize(("scene", "mesh"), [("castle", None), ("mesh", None), ("default", "x.obj")])
-def test_scenes_that_do_not_exist_are_explained(scene, mesh):
-    with pytest.raises(UserError, match="scene is one of default, letters"):
-        build(scene, mesh)
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"scene": "castle"}, "scene is one of default, letters"),
+        ({"scene": "mesh"}, "scene is one of default, letters"),
+        ({"scene": "letters", "mesh": "x.obj"}, "scene is one of default, letters"),
+        ({"mesh": "x.obj"}, "without scene=mesh"),
+        ({"bodies": ({"kind": "sphere"},), "mesh": "x.obj"}, "without scene=mesh"),
+        ({"bodies": ({"kind": "sphere"},), "random": 0}, "found bodies and random; .* give one of them"),
+        ({"bodies": ({"kind": "sphere"},), "scene": "letters"}, "found scene and bodies"),
+        ({"bodies": ({"kind": "cube"},)}, "body 1 has no known kind"),
+    ],
+)
+def test_scenes_that_do_not_exist_are_explained(given, words):
+    with pytest.raises(UserError, match=words):
+        build(Options(**given))
+
+
+def test_bodies_are_one_argument_and_are_written_down(tmp_path):
+    out = tmp_path / "a.hdf5"
+    ball = "{kind: sphere, radius: 0.12, at: [0.1, 0, 0.5]}"
+    word = "{kind: text, text: 'NO', at: [-0.1, 0, 0.7], texture: halves, albedo: [0.3, 0.9]}"
+    main([f"out={out}", f"bodies=[{ball}, {word}]", *SMALL])
+    told = read_capture(out).provenance["bodies"]
+    assert [body["kind"] for body in told] == ["sphere", "text"]
+    assert told[0] == {"kind": "sphere", "radius": 0.12, "at": [0.1, 0, 0.5]}
+    truth = load_truth(out.with_name("a_truth.h5"))
+    assert np.nanmin(truth.depth) == pytest.approx(0.38, abs=1e-3)
+    assert np.nanmax(truth.depth) == pytest.approx(0.7, abs=1e-3)
+    assert set(np.unique(truth.albedo[np.isfinite(truth.albedo)]).round(6)) == {0.3, 0.8, 0.9}
+
+
+def test_one_body_needs_no_list():
+    options, _, _ = parse(["bodies={kind: cone, height: 0.3}"])
+    assert list(options.bodies) == [{"kind": "cone", "height": 0.3}]
+
+
+def test_brackets_that_do_not_match_are_explained():
+    with pytest.raises(UserError, match=r"cannot read bodies=\[\{kind: sphere: brackets"):
+        parse(["bodies=[{kind: sphere"])
+
+
+def test_a_random_scene_is_as_drawn_but_for_what_is_given(tmp_path, capsys):
+    drawn = draw_scene(3)
+    options, scan, sensor = parse(["random=3", "nx=5", "background=0.4"])
+    assert build(options)[1] == drawn.bodies
+    assert (scan.nx, scan.ny, scan.n_bins) == (5, drawn.scan.ny, drawn.scan.n_bins)
+    assert (sensor.background, sensor.mean_counts) == (0.4, drawn.sensor.mean_counts)
+    main([f"out={tmp_path / 'a.hdf5'}", "random=3", "nx=3", "ny=4"])
+    line = capsys.readouterr().out.splitlines()[0]
+    assert build(parse([line])[0])[1] == drawn.bodies
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_hydra_reads_the_same_line(seed):
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+
+    line = draw_scene(seed).line()
+    (override,) = OverridesParser.create().parse_overrides([line])
+    assert build(Options(bodies=tuple(override.value())))[1] == draw_scene(seed).bodies
