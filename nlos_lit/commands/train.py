@@ -1,21 +1,24 @@
-"""Reconstruct a hidden scene by self-calibration."""
+"""Reconstruct a hidden scene: by self-calibration, as a surface, or by the one and then the other."""
 
 from __future__ import annotations
 
 import logging
+import shlex
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import lightning as L
 import torch
+from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.runtime.command_line import (
     output_folder,
     quiet_libraries,
@@ -24,10 +27,19 @@ from nlos_lit.runtime.command_line import (
     write_config,
 )
 from nlos_lit.training.callbacks import History, ScoreHeldout
-from nlos_lit.training.configs import register_settings
+from nlos_lit.training.configs import register_settings, run_config
 from nlos_lit.training.instantiate import build_all, builder
-from nlos_lit.training.outcome import refine_run, write_results
-from nlos_lit.training.run_folder import field_shards, find_checkpoint, prepare_run
+from nlos_lit.training.outcome import write_results, write_surface_summary
+from nlos_lit.training.run_folder import (
+    Run,
+    field_shards,
+    find_checkpoint,
+    fitted_of,
+    load_fitted,
+    prepare_run,
+)
+from nlos_lit.training.surface_fitting import SurfaceFitting
+from nlos_lit.training.surface_run import prepare_surface, write_surface
 
 log = logging.getLogger(__name__)
 C = TypeVar("C", bound=L.Callback)
@@ -41,7 +53,9 @@ def prepare(arguments: list[str]) -> None:
 
 
 def train(config: DictConfig) -> None:
-    """Train as ``conf/train.yaml`` says, export, refine where that is asked for, and say what came out.
+    """Fit as ``conf/train.yaml`` says, export, and say what came out.
+
+    That is a self-calibration, the surface, or with ``refine=true`` the one and then the other.
 
     Raises:
         UserError: the data, the geometry or the settings cannot work.
@@ -49,33 +63,136 @@ def train(config: DictConfig) -> None:
     began = time.perf_counter()
     quiet_libraries()
     folder = output_folder()
-    checkpoint = find_checkpoint(config.ckpt_path, folder, config.scene.name)
+    alone = config.fit == "surface"
+    if alone and config.run is not None:
+        config.model = run_config(config.run)["model"]  # the image is formed as it was there
+    place = "refined/checkpoints" if alone else "checkpoints"
+    checkpoint = find_checkpoint(config.ckpt_path, folder, config.scene.name, place)
     config.folder = str(folder)
     settings = write_config(config, folder)
     L.seed_everything(settings["seed"], verbose=False)
     if settings["threads"]:
         torch.set_num_threads(settings["threads"])
+    config.folder = str(folder / "refined")
+    of_surface = surface_settings(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), alone)
+    fit = _surface_alone if alone else _self_calibration
+    summary = fit(settings, of_surface, folder, checkpoint, began)
+    if summary is not None:
+        _tell(summary, folder)
+
+
+def _self_calibration(
+    settings: dict[str, Any], of_surface: dict[str, Any], folder: Path, checkpoint: Path | None, began: float
+) -> dict[str, Any] | None:
+    """Fit, then the surface where that is asked for; None in processes that only help."""
+    if settings["fit"] != "volume" or settings["run"] is not None:
+        raise UserError(
+            f"found fit={settings['fit']} and run={settings['run']}: a self-calibration starts from nothing; "
+            "to fit the surface of a finished run give model=surface run=FOLDER"
+        )
     trainer = make_trainer(settings)
     history = callback_of(trainer, History)
     callback_of(trainer, ScoreHeldout)
-    device = "cuda" if settings["trainer"]["accelerator"] in ("gpu", "cuda") else "cpu"
-    run = prepare_run(settings, device, field_shards(settings))
-    try:
-        trainer.fit(
-            run.module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None
-        )
-    except SystemExit:  # Lightning's answer to Ctrl-C
-        name = settings["scene"]["name"]
-        log.info(
-            "interrupted; go on with: python train.py scene=%s ckpt_path=last hydra.run.dir=%s", name, folder
-        )
-        sys.exit(130)
+    run = prepare_run(settings, device_of(settings), field_shards(settings))
+    fit_or_leave(trainer, run.module, run, checkpoint, folder)
+    if trainer.checkpoint_callbacks:  # also where the last iteration is none of every n-th
+        trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     run.module.pipeline.phasor.hold()  # with the processes that end here
     if not trainer.is_global_zero:
-        return
-    refined = refine_run(run, folder) if settings["refine"] or settings["effects"] else None
-    summary = write_results(run, history, folder, time.perf_counter() - began, refined)
-    _tell(summary, folder)
+        return None
+    refined = None
+    if settings["refine"] or settings["effects"]:
+        begun = folder / "refined" / "checkpoints" / "last.ckpt"
+        goes_on = checkpoint is not None and history.ran == 0 and begun.exists()
+        refined = _surface(run, of_surface, folder, begun if goes_on else None)[0]
+    return write_results(run, history, folder, time.perf_counter() - began, refined)
+
+
+def _surface_alone(
+    settings: dict[str, Any], of_surface: dict[str, Any], folder: Path, checkpoint: Path | None, began: float
+) -> dict[str, Any]:
+    """The surface of the phasor image with start values, or of the image of a finished run."""
+    source = None if settings["run"] is None else fitted_of(Path(settings["run"]), settings)
+    make_trainer(of_surface)  # what cannot work is said before the image is formed
+    run = prepare_run(settings, device_of(settings))
+    if source is not None:
+        load_fitted(run, source)
+    run.module.pipeline.phasor.hold()
+    response = None if source is None else run.module.pipeline.laser_sensor
+    refined, module, history = _surface(run, of_surface, folder, checkpoint, response)
+    return write_surface_summary(run, module, history, folder, time.perf_counter() - began, refined)
+
+
+def _surface(
+    run: Run,
+    of_surface: dict[str, Any],
+    folder: Path,
+    checkpoint: Path | None,
+    response: LaserSensor | None = None,
+) -> tuple[dict[str, Any], SurfaceFitting, History]:
+    """Fit and export the surface of a run's image: the summary's entry, the module, the history."""
+    began = time.perf_counter()
+    trainer = make_trainer(of_surface)
+    history = callback_of(trainer, History)
+    callback_of(trainer, ScoreHeldout)
+    module = prepare_surface(run, response)
+    fit_or_leave(trainer, module, run, checkpoint, folder)
+    if trainer.checkpoint_callbacks:
+        trainer.save_checkpoint(folder / "refined" / "checkpoints" / "last.ckpt")
+    return write_surface(run, module, folder / "refined", began), module, history
+
+
+def surface_settings(settings: dict[str, Any], alone: bool) -> dict[str, Any]:
+    """Settings of the Trainer that fits the surface: one process, until the fit says that it is done.
+
+    Args:
+        settings: resolved, with the folder of the surface.
+        alone: nothing is fitted before it.
+
+    Returns:
+        The same with another section ``trainer``.
+
+    Raises:
+        UserError: several processes were asked for, and there is only the surface to fit.
+    """
+    trainer = settings["trainer"]
+    if alone and (trainer["devices"] not in (1, "auto") or settings["shard_field"]):
+        raise UserError(
+            f"model=surface is fitted in one process; found trainer.devices={trainer['devices']} and "
+            f"shard_field={settings['shard_field']}: leave trainer=ddp and shard_field out"
+        )
+    one = {"devices": 1, "num_nodes": 1, "strategy": "auto", "precision": "32-true"}
+    by_itself = {"max_epochs": -1, "gradient_clip_val": None}
+    return {**settings, "trainer": {**trainer, **one, **by_itself}}
+
+
+def device_of(settings: Mapping[str, Any]) -> str:
+    """Where a Trainer with these settings puts a module, for what is made before it begins."""
+    return "cuda" if settings["trainer"]["accelerator"] in ("gpu", "cuda") else "cpu"
+
+
+def fit_or_leave(
+    trainer: L.Trainer, module: L.LightningModule, run: Run, checkpoint: Path | None, folder: Path
+) -> None:
+    """Fit; where the user interrupts that, say how to go on and end the process.
+
+    Args:
+        trainer: as :func:`make_trainer` gives it.
+        module: that is fitted.
+        run: whose data are taken.
+        checkpoint: to go on from.
+        folder: of the run.
+    """
+    try:
+        trainer.fit(
+            module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None
+        )
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        given = HydraConfig.get().overrides.task
+        again = ["ckpt_path=last", f"hydra.run.dir={folder}"]
+        kept = [override for override in given if not override.startswith("ckpt_path=")]
+        log.info("interrupted; go on with: %s", shlex.join(["python", "train.py", *kept, *again]))
+        sys.exit(130)
 
 
 def make_trainer(settings: Mapping[str, Any]) -> L.Trainer:

@@ -56,7 +56,7 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
                 continue
             step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0]
             low, high = (
-                torch.tensor([getattr(p, b) - nulls[p.name] for p in effect.amplitudes])
+                torch.tensor([getattr(p, b) - nulls[p.name] for p in effect.amplitudes], device=counts.device)
                 for b in ("lower", "upper")
             )
             step = step.clamp(low, high)

@@ -258,10 +258,19 @@ class SurfelFit:
         """Become what :meth:`state` held, on the device of the counts.
 
         Surfels are other objects from then on, effects keep theirs.
+
+        Raises:
+            UserError: it is the state of a fit with other effects.
         """
         device, state = self.counts.device, copy.deepcopy(state)
         for name in ("order", "place", "tested", "done", "more", "before", "history", "losses"):
             setattr(self, name, state[name])
+        own, kept = self.extension.state_dict().keys(), state["extension"].keys()
+        if own != kept:
+            raise UserError(
+                f"the kept surface fit has effects with {sorted(kept) or 'nothing'}, this one with "
+                f"{sorted(own) or 'nothing'}; go on with the same effects, or begin anew"
+            )
         self.model = SurfelModel.from_state(self.capture, state["model"])
         self.extension.load_state_dict(state["extension"])
         self.reserve, self.generator = Seeds(*state["reserve"]), torch.Generator()

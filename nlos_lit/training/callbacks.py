@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import Any, cast
 
 import lightning as L
-import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from data_modules.spots import CaptureDataModule
-from nlos_lit.functional.losses import sparsity
-from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import Ticker
-from nlos_lit.training.self_calibration import SelfCalibration
-from nlos_lit.training.shown import run_figures, shown_spots
+from nlos_lit.training.capture_fit import CaptureFit
+from nlos_lit.training.shown import shown_spots
 
 
 def _data(trainer: L.Trainer) -> CaptureDataModule:
@@ -36,9 +33,9 @@ class ScoreHeldout(L.Callback):
             trainer: its data module holds the spots.
             module: what is scored; gets ``scores["initial"]``.
         """
-        module = cast(SelfCalibration, module)
+        module = cast(CaptureFit, module)
         if not module.scores:
-            module.scores = {"initial": self._score(trainer, module)}
+            module.scores = {"initial": module.all_scores(_data(trainer))}
 
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Score what was fitted.
@@ -47,28 +44,19 @@ class ScoreHeldout(L.Callback):
             trainer: its data module holds the spots.
             module: what is scored; gets ``scores["final"]``.
         """
-        module = cast(SelfCalibration, module)
-        module.scores["final"] = self._score(trainer, module)
-
-    def _score(self, trainer: L.Trainer, module: SelfCalibration) -> dict[str, float]:
-        data = _data(trainer)
-        heldout = module.score(data.heldout_dataloader())
-        train = module.score(data.reference_dataloader())
-        with torch.no_grad():
-            volume = module.pipeline.phasor()
-            regular = module.regularisation(volume, module.pipeline.albedo(volume))
-            clean = float(sparsity(volume))
-        loss = train["mse"] + sum(float(term) for term in regular.values())
-        return {**heldout, "loss": loss, "sparsity": clean, "train_mse": train["mse"]}
+        module = cast(CaptureFit, module)
+        module.scores["final"] = module.all_scores(_data(trainer))
 
 
 class History(L.Callback):
     """Loss terms and imaging parameters of every iteration, kept through checkpoints, sent to the loggers.
 
     ``values``: ``loss/NAME`` and ``parameters/NAME`` → a number an iteration. ``seconds``: of each iteration.
+    ``ran``: iterations of this process, without those of a checkpoint.
     """
 
     def __init__(self) -> None:
+        self.ran = 0
         self.values: dict[str, list[float]] = {}
         self.seconds: list[float] = []
 
@@ -94,17 +82,18 @@ class History(L.Callback):
             module: the run's; its imaging parameters are noted.
             outputs: loss terms, as ``training_step`` returns them.
         """
-        module = cast(SelfCalibration, module)
+        module = cast(CaptureFit, module)
         for name, value in outputs.items():
             self.values.setdefault(f"loss/{name}", []).append(float(value.detach()))
         for name, entry in module.imaging_parameters().items():
             self.values.setdefault(f"parameters/{name}", []).append(entry["value"])
             module.log(f"parameters/{name}", entry["value"], batch_size=1)
         self.seconds.append(time.perf_counter() - self.began)
+        self.ran += 1
 
 
 class ProgressBar(L.Callback):
-    """Iterations done, the latest loss and held-out error, the time left."""
+    """Batches done, the latest loss and held-out error, the time left."""
 
     def __init__(self) -> None:
         self.ticker: Ticker | None = None
@@ -112,8 +101,8 @@ class ProgressBar(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show the bar, in one of several processes."""
         if trainer.is_global_zero:
-            assert trainer.max_epochs is not None  # Lightning sets it when a fit begins
-            self.ticker = Ticker("iterations", trainer.max_epochs, trainer.current_epoch)
+            module = cast(CaptureFit, module)
+            self.ticker = Ticker(module.what, module.planned, trainer.current_epoch)
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Move it on."""
@@ -123,7 +112,8 @@ class ProgressBar(L.Callback):
             parts += (
                 [f"held-out NMSE {float(metrics['heldout/nmse']):.4f}"] if "heldout/nmse" in metrics else []
             )
-            self.ticker.update(trainer.current_epoch + 1, ", ".join(parts))
+            planned = cast(CaptureFit, module).planned
+            self.ticker.update(trainer.current_epoch + 1, ", ".join(parts), total=planned)
 
     def on_train_end(self, *_: Any) -> None:
         """Close it."""
@@ -139,9 +129,9 @@ class ProgressBar(L.Callback):
 
 
 class Figures(L.Callback):
-    """Figures in TensorBoard: kernel, transients, volume, albedo, surface; the first volume also as a file.
+    """Figures of the present state in TensorBoard; those of the very start also as files in ``figures/``.
 
-    The file is ``figures/volume_first.png`` below the trainer's ``default_root_dir``.
+    That folder is below the trainer's ``default_root_dir``.
 
     Args:
         every: iterations between figures; also before the first and after the last.
@@ -153,34 +143,28 @@ class Figures(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show what the fit starts from."""
-        module = cast(SelfCalibration, module)
-        phasor = module.pipeline.phasor
-        phasor.hold()
+        module = cast(CaptureFit, module)
+        module.hold()
         self._show(trainer, module)
         if trainer.is_global_zero and trainer.current_epoch == 0:
-            with torch.no_grad():
-                volume = phasor().cpu().numpy()
-            grid, threshold = phasor.grid, module.pipeline.geometry.threshold
-            shown = figures.volume_projections(
-                volume, grid, threshold=threshold, title="intensity before the first iteration"
-            )
-            save_figure(shown, Path(trainer.default_root_dir) / "figures" / "volume_first.png")
-        phasor.release()
+            for name, figure in module.first_figures().items():
+                save_figure(figure, Path(trainer.default_root_dir) / "figures" / f"{name}.png")
+        module.release()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show the state after every ``every`` iterations and after the last."""
-        step = trainer.current_epoch + 1
-        if step % self.every == 0 or step == trainer.max_epochs:
-            module = cast(SelfCalibration, module)
-            module.pipeline.phasor.hold()
+        module, step = cast(CaptureFit, module), trainer.current_epoch + 1
+        if step % self.every == 0 or step == module.planned:
+            module.hold()
             self._show(trainer, module)
-            module.pipeline.phasor.release()
+            module.release()
 
-    def _show(self, trainer: L.Trainer, module: SelfCalibration) -> None:
+    def _show(self, trainer: L.Trainer, module: CaptureFit) -> None:
         boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
         if trainer.is_global_zero and boards:
             capture = _data(trainer).capture
-            spots = shown_spots(capture.n_spots, self.transients)
-            for name, figure in run_figures(module, capture, spots).items():
+            for name, figure in module.figures(
+                capture, shown_spots(capture.n_spots, self.transients)
+            ).items():
                 for board in boards:
                     board.experiment.add_figure(name, figure, global_step=trainer.current_epoch)

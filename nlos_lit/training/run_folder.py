@@ -33,6 +33,7 @@ from nlos_lit.training.self_calibration import SelfCalibration
 
 log = logging.getLogger(__name__)
 
+NOT_OF_THE_CAPTURE = ("iterations", "threshold", "wavelength")  # settings of a scene
 LATER_LIBRARIES = 100 * 2**20  # what logging, figures and export load after the estimate
 
 
@@ -168,19 +169,61 @@ def open_run(folder: str | Path) -> Run:
             f"{folder} is not the folder of a finished run: {checkpoint.relative_to(folder)} is missing"
         )
     run = prepare_run(config)
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    run.module.load_state_dict(state["state_dict"])
-    run.module.scores = state["scores"]
+    load_fitted(run, checkpoint)
     return run
 
 
-def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | None:
+def load_fitted(run: Run, checkpoint: Path) -> None:
+    """Take over fitted parameters and scores.
+
+    Args:
+        run: with the settings of the fitted one; changed in place.
+        checkpoint: of the fitted run.
+    """
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    run.module.load_state_dict(state["state_dict"])
+    run.module.scores = state["scores"]
+
+
+def fitted_of(folder: Path, settings: Mapping[str, Any]) -> Path:
+    """The checkpoint of a finished run whose image other settings are to start from.
+
+    Args:
+        folder: of the run.
+        settings: resolved; they must be of the same capture and held-out spots.
+
+    Returns:
+        The file.
+
+    Raises:
+        UserError: it is the folder of no finished run, or of one with another capture or held-out spots.
+    """
+    theirs, checkpoint = run_config(folder), folder / "checkpoints" / "last.ckpt"
+    if not checkpoint.exists():
+        raise UserError(
+            f"{folder} is the folder of no finished self-calibration: checkpoints/last.ckpt is missing"
+        )
+    kept = [f"scene.{key}" for key in settings["scene"] if key not in NOT_OF_THE_CAPTURE]
+    for key in [*kept, *(f"heldout.{key}" for key in settings["heldout"]), "seed"]:
+        section, _, name = key.partition(".")
+        mine, other = (s[section][name] if name else s[section] for s in (settings, theirs))
+        if mine != other:
+            raise UserError(
+                f"run={folder} was made with {key}={other}, this command has {mine}; give the same"
+            )
+    return checkpoint
+
+
+def find_checkpoint(
+    ckpt_path: str | None, folder: Path, scene: str, place: str = "checkpoints"
+) -> Path | None:
     """The checkpoint file to go on from.
 
     Args:
         ckpt_path: a file, or ``last``: that of ``folder``, else of the newest run beside it; None for none.
         folder: of the run that is about to begin.
         scene: its scene's name, for the error message.
+        place: where in a run's folder its checkpoints are.
 
     Returns:
         The file; None where nothing is resumed.
@@ -194,14 +237,13 @@ def find_checkpoint(ckpt_path: str | None, folder: Path, scene: str) -> Path | N
         if not Path(ckpt_path).is_file():
             raise UserError(f"ckpt_path={ckpt_path} does not exist; give a checkpoint file or ckpt_path=last")
         return Path(ckpt_path)
-    own = folder / "checkpoints" / "last.ckpt"
+    own = folder / place / "last.ckpt"
     if own.exists():
         return own
-    others = sorted(folder.parent.glob("*/checkpoints/last.ckpt"), key=lambda path: path.stat().st_mtime)
+    others = sorted(folder.parent.glob(f"*/{place}/last.ckpt"), key=lambda path: path.stat().st_mtime)
     if not others:
         raise UserError(
-            f"ckpt_path=last: neither {folder} nor another run of '{scene}' beside it has "
-            "checkpoints/last.ckpt"
+            f"ckpt_path=last: neither {folder} nor another run of '{scene}' beside it has {place}/last.ckpt"
         )
     return others[-1]
 

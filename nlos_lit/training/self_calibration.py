@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import lightning as L
+import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.capture import Capture
+from nlos_lit.functional.losses import sparsity
 from nlos_lit.functional.sharded import leave_buffers
-from nlos_lit.metrics.transients import expected_deviance, nmse_noise_floor, poisson_deviance
 from nlos_lit.model.objective import Objective, parameter_groups, rated_groups
 from nlos_lit.model.pipeline import Pipeline
+from nlos_lit.training.capture_fit import CaptureFit
+from nlos_lit.training.shown import first_volume, run_figures
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
 
-class SelfCalibration(L.LightningModule):
+class SelfCalibration(CaptureFit):
     """Minimise Eq. 11-14 over Θ = {Θ_pf, Θ_ls, Θ_G}.
 
-    One epoch is one iteration (one batch of spots), so that every checkpoint lies between two optimiser steps
-    and a resumed run repeats the uninterrupted one.
+    One epoch is one iteration (one batch of spots), and a resumed run repeats the uninterrupted one.
 
     Args:
         pipeline: the simulated measurement, its phasor field prepared (or by ``prepare``).
@@ -44,10 +49,9 @@ class SelfCalibration(L.LightningModule):
         rates: Mapping[str, float],
         prepare: Callable[[], None] | None = None,
     ) -> None:
-        super().__init__()
+        super().__init__(objective.scale)
         self.pipeline, self.criterion, self.rates, self.make_optimizer = pipeline, objective, rates, optimizer
         self.optimised = [name for name in parameter_groups(pipeline) if optimise[name]]
-        self.scores: dict[str, dict[str, float]] = {}
         self._prepare = prepare
         self._freeze()
 
@@ -59,6 +63,12 @@ class SelfCalibration(L.LightningModule):
             self._prepare = None
             self._freeze()  # matching the energy makes a new parameter
         leave_buffers(self)
+
+    @property
+    def planned(self) -> int:
+        """Iterations in all."""
+        assert self.trainer.max_epochs is not None  # Lightning sets it when a fit begins
+        return self.trainer.max_epochs
 
     def imaging_parameters(self) -> dict[str, dict[str, Any]]:
         """The six imaging parameters by the paper's names: ``{name: {"value", "unit"}}``."""
@@ -110,44 +120,43 @@ class SelfCalibration(L.LightningModule):
             self.log(label, value.detach(), on_step=False, on_epoch=True, sync_dist=True, batch_size=1)
         return terms
 
-    def validation_step(self, batch: dict[str, Tensor], batch_idx: int) -> None:
-        """Add a batch of monitored held-out spots to the scores.
+    @torch.no_grad()
+    def expected(self, spots: Tensor) -> Tensor:
+        """``[B, T_gate]`` rendered counts of spots ``[B]``."""
+        return self.pipeline(spots).expected
 
-        Args:
-            batch: as in :meth:`training_step`.
-            batch_idx: not looked at.
-        """
-        self._add_score(batch)
+    def loss_of(self, train: dict[str, float]) -> dict[str, float]:
+        """Loss over training spots with these scores, and E_Ipf without its factor."""
+        with torch.no_grad():
+            volume = self.pipeline.phasor()
+            regular = self.regularisation(volume, self.pipeline.albedo(volume))
+            clean = float(sparsity(volume))
+        return {"loss": train["mse"] + sum(float(term) for term in regular.values()), "sparsity": clean}
+
+    def figures(self, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
+        """Kernel, transients, volume, albedo, surface: :func:`~nlos_lit.training.shown.run_figures`."""
+        return run_figures(self, capture, spots)
+
+    def hold(self) -> None:
+        """Keep the volume; processes that share its field do so together."""
+        self.pipeline.phasor.hold()
+
+    def release(self) -> None:
+        """Let it go."""
+        self.pipeline.phasor.release()
+
+    def first_figures(self) -> dict[str, Figure]:
+        """The volume before the first iteration."""
+        return {"volume_first": first_volume(self)}
 
     def on_validation_epoch_start(self) -> None:
         """Empty the sums, keep the volume: parameters stand still meanwhile."""
-        self.pipeline.phasor.hold()
-        self._sums = torch.zeros(6, dtype=torch.float64, device=self.device)
-
-    def on_validation_epoch_end(self) -> None:
-        """Send the scores to the loggers as ``heldout/NAME``."""
-        for name, value in self._finish_score().items():
-            self.log(f"heldout/{name}", value)
-
-    @torch.no_grad()
-    def score(self, batches: Any) -> dict[str, float]:
-        """NMSE, deviance per bin and their noise levels over this rank's ``batches``, summed over ranks."""
-        self.on_validation_epoch_start()
-        for batch in batches:
-            self._add_score({name: value.to(self.device) for name, value in batch.items()})
-        return self._finish_score()
+        self.hold()
+        super().on_validation_epoch_start()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         """Of the groups that are optimised; Lightning calls it when the fit begins."""
         return self.make_optimizer(rated_groups(self.pipeline, self.rates, self.optimised))
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the scores from before the first iteration."""
-        checkpoint["scores"] = self.scores
-
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take them back."""
-        self.scores = checkpoint["scores"]
 
     def _freeze(self) -> None:
         """What is not optimised keeps its value."""
@@ -156,31 +165,8 @@ class SelfCalibration(L.LightningModule):
             for parameter in parameters:
                 parameter.requires_grad_(name in self.optimised)
 
-    def _add_score(self, batch: dict[str, Tensor]) -> None:
-        counts, expected = batch["counts"], self.pipeline(batch["spots"]).expected
-        noise = expected_deviance(expected) * counts.numel()
-        floor = nmse_noise_floor(counts) * (counts.double() ** 2).sum()
-        self._sums += torch.stack(
-            [
-                ((counts - expected).double() ** 2).sum(),
-                (counts.double() ** 2).sum(),
-                floor,
-                poisson_deviance(counts, expected).sum(),
-                noise,
-                torch.tensor(float(counts.numel()), dtype=torch.float64, device=counts.device),
-            ]
-        )
-
-    def _finish_score(self) -> dict[str, float]:
-        self.pipeline.phasor.release()
-        sums = self._sums
+    def _summed(self, sums: Tensor) -> Tensor:
+        self.release()
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.all_reduce(sums)
-        error, energy, floor, deviance, noise, bins = sums.tolist()
-        return {
-            "nmse": error / energy,
-            "nmse_noise_floor": floor / energy,
-            "mse": error / bins / self.criterion.scale**2,
-            "deviance_per_bin": deviance / bins,
-            "deviance_noise": noise / bins,
-        }
+        return sums

@@ -1,4 +1,4 @@
-"""What a run shows of itself: the transients of a few spots, the surface they see, figures of its state."""
+"""What a self-calibration shows of itself: a few transients, the surface they see, figures of its state."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from nlos_lit.capture import Capture
 from nlos_lit.functional.march import trilinear
 from nlos_lit.io.points import Points
 from nlos_lit.report import figures
-from nlos_lit.training.self_calibration import SelfCalibration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from nlos_lit.training.self_calibration import SelfCalibration
 
 GOLDEN = 0.6180339887498949  # its multiples fill the unit interval evenly
 
@@ -50,6 +51,22 @@ def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
     return [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
 
 
+def transients_of(capture: Capture, spots: np.ndarray, expected: torch.Tensor) -> Figure:
+    """Measured and expected transients of a few spots over path length.
+
+    Args:
+        capture: the measurement.
+        spots: ``[K]`` rows of it.
+        expected: ``[K, T_gate]`` counts.
+
+    Returns:
+        a figure with a panel a spot.
+    """
+    path = capture.path_gate[0] + (np.arange(expected.shape[1]) + 0.5) * capture.bin_length
+    measured = capture.gated_counts()[spots]
+    return figures.transients_plot(measured, expected.cpu().numpy(), path, spot_labels(capture, spots))
+
+
 @torch.no_grad()
 def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
     """Figures of the present state of a run.
@@ -69,22 +86,25 @@ def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) ->
     volume, albedo = rendering.intensity.cpu().numpy(), rendering.albedo.cpu().numpy()
     sensor = pipeline.laser_sensor
     psi = sensor.kernel().cpu().numpy()
-    start = capture.path_gate[0]
-    path = start + (np.arange(rendering.expected.shape[1]) + 0.5) * capture.bin_length
-    measured = capture.gated_counts()[spots]
     threshold = pipeline.geometry.threshold
     return {
         "volume": figures.volume_projections(volume, grid, threshold=threshold, title="intensity"),
         "albedo": figures.albedo_projection(albedo, volume >= threshold, grid),
-        "transients": figures.transients_plot(
-            measured, rendering.expected.cpu().numpy(), path, spot_labels(capture, spots)
-        ),
+        "transients": transients_of(capture, spots, rendering.expected),
         "kernel": figures.kernel_plot(float(pipeline.phasor.omega_pf()), float(pipeline.phasor.sigma_pf())),
         "laser_sensor": figures.laser_sensor_plot(
             psi, capture.bin_length, first=-sensor.lead * capture.bin_length
         ),
         "surface": figures.surface_plot(surface_points(module, capture, spots)),
     }
+
+
+@torch.no_grad()
+def first_volume(module: SelfCalibration) -> Figure:
+    """The volume as it is before the first iteration."""
+    phasor = module.pipeline.phasor
+    title, threshold = "intensity before the first iteration", module.pipeline.geometry.threshold
+    return figures.volume_projections(phasor().cpu().numpy(), phasor.grid, threshold=threshold, title=title)
 
 
 @torch.no_grad()

@@ -151,7 +151,17 @@ def test_no_key_that_nothing_reads():
                         continue
                     if accepted is None or path[-1] not in accepted:
                         unread.add(".".join(path))
-    assert {"effects", "refine", "toys", "run", "threads", "iterations", "precision", "dirpath"} <= seen
+    assert {
+        "effects",
+        "refine",
+        "fit",
+        "toys",
+        "run",
+        "threads",
+        "iterations",
+        "precision",
+        "dirpath",
+    } <= seen
     assert unread == set()
 
 
@@ -219,7 +229,12 @@ CODE = DEFAULT | {
 
 @pytest.mark.parametrize(
     ("profile", "model", "sparsity", "clip"),
-    [("default", DEFAULT, 3e-3, None), ("paper", PAPER, 100.0, None), ("reference_code", CODE, 100.0, 10.0)],
+    [
+        ("default", DEFAULT, 3e-3, None),
+        ("paper", PAPER, 100.0, None),
+        ("reference_code", CODE, 100.0, 10.0),
+        ("surface", DEFAULT, 3e-3, None),
+    ],
 )
 def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, clip):
     config = composed(f"model={profile}")
@@ -233,7 +248,8 @@ def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, 
     assert config["trainer"]["gradient_clip_val"] == clip
     assert composed(f"model={profile}", command="diagnose")["model"] == model
     assert composed(f"model={profile}", "optimizer.clip=3")["optimizer"]["clip"] == 3
-    assert set(names("model")) == {"default", "paper", "reference_code"}
+    assert config["fit"] == ("surface" if profile == "surface" else "volume")
+    assert set(names("model")) == {"default", "paper", "reference_code", "surface"}
 
 
 def test_the_base_of_a_diagnosis_has_fewer_surfels():

@@ -21,8 +21,8 @@ from nlos_lit.io.points import read_points
 from nlos_lit.io.volumes import read_volume
 from nlos_lit.surfels.fitted import score_spots
 from nlos_lit.training.configs import compose
-from nlos_lit.training.outcome import load_refined
 from nlos_lit.training.run_folder import open_run, prepare_run
+from nlos_lit.training.surface_run import load_refined
 
 SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
@@ -194,10 +194,8 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     )  # fmt: skip
     output = done.stdout + done.stderr
     assert done.returncode == 130, output
-    assert (
-        f"interrupted; go on with: python train.py scene=default ckpt_path=last hydra.run.dir={folder}"
-        in output
-    )
+    assert "interrupted; go on with: python train.py " in output
+    assert f"scene.iterations=6 logger=none ckpt_path=last hydra.run.dir={folder}\n" in output
     assert not (folder / "summary.json").exists()
     assert state(folder)["epoch"] == 2  # though spots were scored after 1 and 3
     train("scene.iterations=6", "logger=none", "ckpt_path=last", folder=folder)

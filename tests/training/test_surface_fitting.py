@@ -1,0 +1,283 @@
+"""The surface under a Trainer: the same digits as without, stopped or not; its folder and its events."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+from lightning.pytorch.callbacks import ModelCheckpoint
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from nlos_lit.capture.errors import UserError
+from nlos_lit.commands.train import surface_settings
+from nlos_lit.io.points import read_points
+from nlos_lit.runtime.command_line import quiet_libraries
+from nlos_lit.surfels.fitted import score_spots
+from nlos_lit.training.callbacks import History, ScoreHeldout
+from nlos_lit.training.configs import compose
+from nlos_lit.training.run_folder import Run, fitted_of, open_run, prepare_run
+from nlos_lit.training.surface_fitting import SurfaceFitting, front
+from nlos_lit.training.surface_run import load_refined, prepare_surface
+
+SMALL = [
+    "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
+    "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
+    "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
+    "trainer.check_val_every_n_epoch=5", "callbacks.checkpoint.every_n_epochs=1",
+    "callbacks.figures.every=20", "surfels.rounds=2", "surfels.steps=8", "surfels.more=1", "threads=1",
+]  # fmt: skip
+EFFECTS = "effects=[irf_tail,wall_reflectance]"
+
+
+def door(*overrides: str, folder: Path, code: str = "", check: bool = True) -> subprocess.CompletedProcess:
+    how = ["-c", code] if code else ["train.py"]
+    done = subprocess.run(
+        [sys.executable, *how, *SMALL, f"hydra.run.dir={folder}", *overrides],
+        cwd=ROOT, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    if check:
+        assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
+    return done
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return prepare_run(compose("train", [*SMALL, EFFECTS, "model=surface"]))
+
+
+def seeded(run: Run) -> SurfaceFitting:
+    torch.manual_seed(0)
+    again = copy.copy(run)
+    again.extension = copy.deepcopy(run.extension)
+    return prepare_surface(again)
+
+
+def trainer_of(folder: Path, epochs: int = -1) -> L.Trainer:
+    quiet_libraries()
+    return L.Trainer(
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        callbacks=[
+            ScoreHeldout(),
+            History(),
+            ModelCheckpoint(folder, save_last=True, every_n_epochs=1, save_on_train_epoch_end=True),
+        ],
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        check_val_every_n_epoch=5,
+        num_sanity_val_steps=0,
+        default_root_dir=folder,
+    )
+
+
+def same(first: object, second: object) -> bool:
+    if torch.is_tensor(first):
+        return torch.equal(first, second)
+    if isinstance(first, dict):
+        return first.keys() == second.keys() and all(same(v, second[k]) for k, v in first.items())
+    if isinstance(first, (list, tuple)):
+        return len(first) == len(second) and all(map(same, first, second))
+    return first == second
+
+
+def test_a_trainer_takes_the_same_steps_stopped_or_not(run, tmp_path):
+    by_hand, whole, part = seeded(run), seeded(run), seeded(run)
+    start = by_hand.fit.state()
+    by_hand.fit.finish()
+    assert len(by_hand.fit.history) == 3  # one round was added
+    trainer_of(tmp_path / "whole").fit(whole, datamodule=run.data)
+    assert same(whole.fit.state(), by_hand.fit.state())
+    assert not same(start["model"], by_hand.fit.state()["model"])
+    stopped = (5, 16, 29)  # in a round, between two, in the second
+    for epochs in stopped:
+        place, go_on = tmp_path / "part", tmp_path / "part" / "last.ckpt"
+        trainer = trainer_of(place, epochs)
+        before = go_on if go_on.exists() else None
+        trainer.fit(part, datamodule=run.data, ckpt_path=before, weights_only=True if before else None)
+        assert (part.fit.done, trainer.global_step) == (epochs, epochs)
+        assert part.fit.in_round == (epochs != 16)
+        part = seeded(run)
+    trainer = trainer_of(place)
+    trainer.fit(part, datamodule=run.data, ckpt_path=go_on, weights_only=True)
+    assert same(part.fit.state(), by_hand.fit.state())
+    assert part.scores == whole.scores
+    assert part.scores["final"]["deviance_per_bin"] < part.scores["initial"]["deviance_per_bin"]
+    assert trainer.callbacks[1].ran == part.fit.done - 29
+    again = seeded(run)
+    trainer = trainer_of(place)
+    trainer.fit(again, datamodule=run.data, ckpt_path=go_on, weights_only=True)
+    assert trainer.callbacks[1].ran == 0
+    assert same(again.fit.state(), by_hand.fit.state())
+    assert again.scores == whole.scores
+
+
+def test_a_checkpoint_of_other_effects_or_of_no_surface_is_refused(run, tmp_path):
+    module = seeded(run)
+    trainer_of(tmp_path, 1).fit(module, datamodule=run.data)
+    kept = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    other = copy.copy(run)
+    other.extension = type(run.extension)([])
+    with pytest.raises(UserError, match=r"effects with .*irf_tail|effects with .*raw.*this one with nothing"):
+        prepare_surface(other).on_load_checkpoint(kept)
+    with pytest.raises(UserError, match="not the checkpoint of a surface"):
+        module.on_load_checkpoint({"state_dict": {}})
+
+
+def test_scores_are_those_of_the_surfels(run):
+    module = seeded(run)
+    found = module.all_scores(run.data)
+    model, extension = module.fit.model, module.fit.extension
+    held = score_spots(model, run.capture, torch.from_numpy(run.data.heldout_spots), extension)
+    assert found["nmse"] == pytest.approx(held.nmse, rel=1e-6)
+    assert found["deviance_per_bin"] == pytest.approx(held.deviance_per_bin, rel=1e-6)
+    reference = score_spots(model, run.capture, torch.from_numpy(run.data.reference), extension)
+    assert found["loss"] == pytest.approx(reference.deviance_per_bin, rel=1e-6)
+
+
+def test_the_front_is_the_nearest_surfel_of_each_cell_that_is_not_faint(run):
+    model = seeded(run).fit.model
+    origin, pitch = (np.array(v) for v in (model.lateral.origin, model.lateral.pitch))
+    cells = np.array([[2, 3], [2, 3], [2, 3], [4, 1]])
+    places = np.column_stack([origin + cells * pitch, [0.8, 0.6, 0.5, 0.7]])
+    up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 3)
+    model.place(torch.from_numpy(places), up, torch.tensor([1.0, 0.5, 0.01, 0.9]))
+    albedo, depth, x, y = front(model)
+    assert depth[2, 3] == pytest.approx(0.6)
+    assert albedo[2, 3] == pytest.approx(0.5)
+    assert depth[4, 1] == pytest.approx(0.7)
+    assert np.isfinite(depth).sum() == np.isfinite(albedo).sum() == 2
+    assert (x[2], y[3]) == pytest.approx(tuple(places[0, :2]))
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("surface") / "one"
+    door("model=surface", EFFECTS, folder=folder)
+    return folder
+
+
+def test_the_door_leaves_a_surface(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    refined, heldout = summary["refined"], summary["heldout"]
+    assert heldout["nmse"]["final"] < heldout["nmse"]["initial"]
+    assert refined["heldout"]["nmse"] == pytest.approx(heldout["nmse"]["final"], rel=1e-3)
+    assert summary["iterations"] == 16 + 16 + 16
+    assert {"sigma_ls", "irf_tail.fraction", "wall_reflectance.rms"} <= set(summary["parameters"])
+    place = finished / "refined"
+    assert {path.name for path in place.iterdir()} >= {
+        "points.ply", "surfels.pt", "effects.pt", "transients.png", "surface.png", "front.png",
+    }  # fmt: skip
+    assert len(read_points(place / "points.ply")) == refined["surfels"]
+    model, extension = load_refined(finished, prepare_run(compose("train", SMALL)).capture)
+    assert (len(model), len(extension.effects)) == (refined["surfels"], 2)
+
+
+def test_events_hold_the_way_of_the_surface(finished):
+    events = EventAccumulator(str(finished / "refined" / "tensorboard"))
+    events.Reload()
+    tags = events.Tags()
+    assert {
+        "loss/total", "loss/counts", "loss/bending", "deviance", "surfels", "heldout/deviance_per_bin",
+        "parameters/sigma_ls", "parameters/irf_tail.fraction",
+    } <= set(tags["scalars"])  # fmt: skip
+    assert len(events.Scalars("deviance")) == 48
+    assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
+    assert {"front", "surface", "transients", "laser_sensor"} <= set(tags["images"])
+    assert len(events.Images("front")) == 4  # at the start, after 20 and 40, at the end
+
+
+CTRL_C = """
+import os, runpy, signal
+from nlos_lit.training.surface_fitting import SurfaceFitting
+
+whole = SurfaceFitting.training_step
+def press(self, batch, batch_idx):
+    if self.fit.done == 13:
+        os.kill(os.getpid(), signal.SIGINT)
+    return whole(self, batch, batch_idx)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit that it is ignored
+SurfaceFitting.training_step = press
+runpy.run_path("train.py", run_name="__main__")
+"""
+
+
+def test_an_interrupted_sequence_goes_on_in_its_second_half(tmp_path):
+    sequence = ("refine=true", "scene.iterations=3", "logger=none")
+    door(*sequence, folder=tmp_path / "straight")
+    done = door(*sequence, folder=tmp_path / "stopped", code=CTRL_C, check=False)
+    output = done.stdout + done.stderr
+    assert done.returncode == 130, output
+    line = shlex.split(output.split("go on with: ")[1].splitlines()[0])
+    assert line[:2] == ["python", "train.py"]
+    assert {*sequence, "ckpt_path=last", f"hydra.run.dir={tmp_path / 'stopped'}"} <= set(line)
+    assert not (tmp_path / "stopped" / "summary.json").exists()
+    again = subprocess.run([sys.executable, *line[1:]], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert again.returncode == 0, again.stderr
+    folders = [tmp_path / name for name in ("straight", "stopped")]
+    first, second = (torch.load(f / "refined" / "surfels.pt", weights_only=True) for f in folders)
+    assert same(first, second)
+    one, two = (json.loads((f / "summary.json").read_text()) for f in folders)
+    for key in ("loss", "heldout", "parameters", "iterations"):
+        assert one[key] == two[key]
+    assert one["refined"]["heldout"] == two["refined"]["heldout"]
+
+
+def test_the_surface_of_a_finished_run_starts_from_its_image_and_response(tmp_path):
+    short = ("logger=none", "surfels.rounds=1", "surfels.steps=2", "surfels.more=0")
+    first = tmp_path / "first"
+    door("scene.iterations=2", *short, folder=first)
+    door("model=surface", f"run={first}", *short, folder=tmp_path / "second")
+    run = open_run(first)
+    sensor = run.module.pipeline.laser_sensor
+    module, untold = prepare_surface(run, sensor), prepare_surface(run)
+    found = module.fit.model.laser_sensor
+    assert found.kappa_s().item() == pytest.approx(sensor.kappa_s().item(), rel=1e-4)
+    assert untold.fit.model.laser_sensor.kappa_s().item() != pytest.approx(found.kappa_s().item(), rel=1e-2)
+    module.fit.begin_round()
+    summary = json.loads((tmp_path / "second" / "summary.json").read_text())
+    assert module.all_scores(run.data)["nmse"] == pytest.approx(
+        summary["heldout"]["nmse"]["initial"], rel=1e-4
+    )
+    for changed, sentence in (
+        ("seed=3", "was made with seed=0, this command has 3"),
+        ("heldout.block=4", "was made with heldout.block=3, this command has 4"),
+        ("scene.sum_bins=2", "was made with scene.sum_bins=1, this command has 2"),
+    ):
+        with pytest.raises(UserError, match=sentence):
+            fitted_of(first, compose("train", [*SMALL, changed]))
+    assert fitted_of(first, compose("train", [*SMALL, "scene.iterations=7"])).name == "last.ckpt"
+    with pytest.raises(UserError, match=r"of no finished self-calibration: checkpoints/last.ckpt is missing"):
+        fitted_of(tmp_path / "second", compose("train", SMALL))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        (["run=nowhere"], "to fit the surface of a finished run give model=surface run=FOLDER"),
+        (["model=surface", "run=nowhere"], "nowhere is not the folder of a finished run"),
+        (["model=surface", "trainer=ddp"], "is fitted in one process; found trainer.devices=2"),
+    ],
+)
+def test_what_cannot_work_is_one_sentence(overrides, sentence, tmp_path):
+    done = door(*overrides, folder=tmp_path, check=False)
+    assert done.returncode == 2
+    assert sentence in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
+def test_the_surfaces_trainer_is_the_runs_in_one_process():
+    both = compose("train", ["trainer=ddp", "optimizer.clip=3", "+trainer.max_time=00:01:00:00"])
+    found = surface_settings(both, alone=False)["trainer"]
+    assert (found["devices"], found["strategy"], found["max_epochs"]) == (1, "auto", -1)
+    assert (found["gradient_clip_val"], found["max_time"]) == (None, "00:01:00:00")
