@@ -123,7 +123,7 @@ def _first_returns(capture: Capture) -> np.ndarray:
     observed = capture.gated_observed()
     found = []
     for spot in range(0, capture.n_spots, max(1, capture.n_spots // 1024)):
-        # Where bins were not recorded, their edges are no returns.
+        # A rise over bins that were not recorded is no return: nobody knows when it began.
         bins = np.arange(last - first) if observed is None else np.flatnonzero(observed[spot])
         if len(bins) == 0:
             continue
@@ -134,7 +134,10 @@ def _first_returns(capture: Capture) -> np.ndarray:
         noise = np.sqrt(max(floor, 1 / width) / width) if capture.is_counts else 0.0
         below = np.flatnonzero(level[:peak] - floor < 0.2 * height)
         if height > 6 * noise and len(below):
-            found.append(bins[int(below[-1]) + 1])
+            at = int(below[-1]) + 1
+            around = bins[max(at - width, 0) : at + width]
+            if around[-1] - around[0] < len(around):
+                found.append(bins[at])
     return (capture.t_start + (first + np.asarray(found, dtype=np.float64) + 0.5) * capture.bin_length) / 2
 
 

@@ -33,8 +33,8 @@ def find_unrecorded(counts: np.ndarray, cropped: bool = False) -> tuple[np.ndarr
     Their counts there (the weakest of them but for one in a thousand, times this spot's level in the bins
     outside the run, at most 1) are λ, and zeros have the probability exp(-λ). Dark spots and low counts give
     a small λ and stay. Where more than one in a thousand of the others is itself without counts for half as
-    long, no further away than the run is long, light may merely come later or end sooner at this spot, and
-    its zeros stay too. A spot without any count is compared by the others' totals.
+    long, in bins that overlap the run's, light may merely come later or end sooner at this spot, and its
+    zeros stay too. A spot without any count is compared by the others' totals.
 
     Bins that are empty in every spot are left as they are, since nothing tells them from the time before the
     first light, unless the format is known to cut its captures.
@@ -102,7 +102,7 @@ def _found(counts: np.ndarray, zeros: _Runs, enough: float) -> _Runs:
         enough: -ln of the probability that a run must fall below.
 
     Returns:
-        some of the runs, short ones first: spots found by them mislead no longer ones.
+        some of the runs.
     """
     mean = np.concatenate([[0.0], np.cumsum(counts.mean(axis=0, dtype=np.float64))])
     # More than half of the spots must hold counts there, so their mean is at most twice that of all.
@@ -116,31 +116,33 @@ def _found(counts: np.ndarray, zeros: _Runs, enough: float) -> _Runs:
     whole = np.ones(len(counts), dtype=bool)
     order = np.lexsort((runs.last, runs.first, runs.length))
     alike = np.flatnonzero((np.diff(runs.first[order]) != 0) | (np.diff(runs.last[order]) != 0)) + 1
-    chosen = []
-    for same in np.split(order, alike):
-        first, last = int(runs.first[same[0]]), int(runs.last[same[0]])
-        a, b = np.searchsorted(edges, (first, last))
-        inside = upto[:, b] - upto[:, a]
-        others = whole & (inside > 0)
-        if 2 * np.count_nonzero(others) <= len(counts):
-            continue
-        level = np.quantile(inside[others], UNLIKE)
-        outside = (total - inside)[runs.spot[same]]
-        share = np.minimum(outside / max((total - inside)[others].mean(), 1e-300), 1.0)
-        dead = outside == 0
-        likely = np.where(dead, 1.0, share) * level > enough
-        if likely.any() and not dead.all() and _dark_nearby(zeros, others, first, last):
-            likely &= dead
-        which = same[likely]
-        whole[runs.spot[which]] = False
-        chosen.append(which)
-    return runs.take(np.concatenate([np.zeros(0, dtype=np.int64), *chosen]))
+    chosen = np.zeros(len(order), dtype=bool)
+    groups, found = np.split(order, alike), True
+    while found:  # again, since spots that were found in one round misled it
+        found = False
+        for same in groups:
+            first, last = int(runs.first[same[0]]), int(runs.last[same[0]])
+            a, b = np.searchsorted(edges, (first, last))
+            inside = upto[:, b] - upto[:, a]
+            others = whole & (inside > 0)
+            if chosen[same].all() or 2 * np.count_nonzero(others) <= len(counts):
+                continue
+            level = np.quantile(inside[others], UNLIKE)
+            outside = (total - inside)[runs.spot[same]]
+            share = np.minimum(outside / max((total - inside)[others].mean(), 1e-300), 1.0)
+            dead = outside == 0
+            likely = ~chosen[same] & (np.where(dead, 1.0, share) * level > enough)
+            if likely.any() and not dead.all() and _dark_beside(zeros, others, first, last):
+                likely &= dead
+            chosen[same[likely]] = True
+            whole[runs.spot[same[likely]]] = False
+            found |= bool(likely.any())
+    return runs.take(chosen)
 
 
-def _dark_nearby(zeros: _Runs, others: np.ndarray, first: int, last: int) -> bool:
-    """Whether zeros for half as long as ``[first, last)``, near it, are more than a rarity in other spots."""
-    length = last - first
-    near = (2 * zeros.length >= length) & (zeros.last > first - length) & (zeros.first < last + length)
+def _dark_beside(zeros: _Runs, others: np.ndarray, first: int, last: int) -> bool:
+    """Whether zeros for half as long as ``[first, last)``, overlapping it, are no rarity in other spots."""
+    near = (2 * zeros.length >= last - first) & (zeros.last > first) & (zeros.first < last)
     dark = np.unique(zeros.spot[near & others[zeros.spot]])
     return len(dark) > UNLIKE * np.count_nonzero(others)
 

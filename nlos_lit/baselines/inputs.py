@@ -50,6 +50,7 @@ def gated_transients(capture: Capture, longest: float, falloff: float) -> tuple[
     first = max(capture.gate[0], int(np.ceil(-t_start / step - 1e-9)))
     last = min(capture.gate[1], int(np.ceil((longest - t_start) / step)) + 1)
     start = t_start + first * step
+    # Bins that were not recorded hold zero: they add nothing to an image that is linear in the counts.
     counts = torch.from_numpy(capture.counts[:, first:last].astype(np.float32))
     if falloff:
         depth = (start + (torch.arange(last - first, dtype=torch.float64) + 0.5) * step) / 2

@@ -144,7 +144,7 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
     smallest = LaserSensor.smallest_sigma(s.splat_sigma) if s.subtract_splat else 0.05
     jitter = max(s.jitter_fwhm_ps / FWHM * SPEED_M_PER_PS / bin_length, 1.05 * smallest)
     scale = normalisation(capture)
-    mean = torch.from_numpy(capture.gated_counts().mean(axis=0, dtype=np.float64))
+    mean = torch.from_numpy(capture.mean_transient()[slice(*capture.gate)])
     background = quietest_level(mean) if s.background_start is None else s.background_start * scale
     background = min(max(background, 2e-6 * scale), 0.5 * scale)
     laser_sensor = LaserSensor(
@@ -162,7 +162,7 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
 
 
 def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
-    """Counts that the loss counts as 1: a quantile of the gated bins.
+    """Counts that the loss counts as 1: a quantile of the gated bins that were recorded.
 
     Args:
         capture: what is fitted.
@@ -174,7 +174,8 @@ def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
     Raises:
         UserError: the gate holds no photons to speak of.
     """
-    values = capture.gated_counts().reshape(-1)
+    values, observed = capture.gated_counts(), capture.gated_observed()
+    values = values.reshape(-1) if observed is None else values[observed]
     rank = min(values.size - 1, int(quantile * values.size))
     scale = float(np.partition(values, rank)[rank])
     if scale == 0:
@@ -202,13 +203,15 @@ def match_energy(pipeline: Pipeline, capture: Capture, spots: torch.Tensor) -> N
     rendering = pipeline(spots)
     measured = torch.from_numpy(capture.gated_counts()[spots.cpu().numpy()]).to(rendering.expected)
     background = sensor.background()
-    rendered = (rendering.expected - background).sum() / sensor.intensity()
+    observed = pipeline.observed_at(spots)
+    seen = torch.ones_like(measured) if observed is None else observed.to(measured)
+    rendered = ((rendering.expected - background) * seen).sum() / sensor.intensity()
     if rendered <= 0:
         raise UserError(
             "the first image has no surface that rays from the wall could meet: lower model.threshold, "
             "or check scene.volume.depth and the wall size"
         )
-    excess = (measured - background).sum().clamp_min(1e-3 * measured.sum())
+    excess = ((measured - background) * seen).sum().clamp_min(1e-3 * measured.sum())
     old = sensor.intensity
     value = float(excess / rendered)
     sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, old.unit).to(

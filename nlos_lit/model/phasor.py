@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import ScanGeometry, scan_geometry
 from nlos_lit.capture.errors import MemoryBudgetError
+from nlos_lit.capture.taper import tapered_counts
 from nlos_lit.capture.volume_grid import VolumeGrid, path_range
 from nlos_lit.functional import phasor as F
 from nlos_lit.functional.even_convolution import convolution_length
@@ -308,9 +309,10 @@ class PhasorImaging(nn.Module):
         return F.frequencies((self.omega_pf.lower, self.omega_pf.upper), self.sigma_pf.lower, period)
 
     def _spectrum(self, capture: Capture, spots: np.ndarray | None) -> Tensor:
-        """``[F, S]`` of the transients of ``spots``, zero elsewhere."""
+        """``[F, S]`` of the transients of ``spots``, zero elsewhere and where nothing was recorded."""
         first, last = self._window(capture)
-        counts = torch.from_numpy(capture.counts[:, first:last].astype(np.float32)).to(self.gain.device)
+        wavelength = 2 * math.pi / float(self.omega_pf())
+        counts = torch.from_numpy(tapered_counts(capture, (first, last), wavelength)).to(self.gain.device)
         if spots is not None:
             counts[torch.from_numpy(np.setdiff1d(np.arange(capture.n_spots), spots))] = 0
         time = capture.t_start + (torch.arange(first, last, dtype=torch.float64) + 0.5) * capture.bin_length

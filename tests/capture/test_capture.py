@@ -12,6 +12,8 @@ from small_capture import NORMAL, fields, grid_points
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
+from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.taper import tapered_counts
 
 
 def altered(array: np.ndarray, index, value) -> np.ndarray:
@@ -21,6 +23,7 @@ def altered(array: np.ndarray, index, value) -> np.ndarray:
 
 
 COUNTS = np.arange(120, dtype=np.float64).reshape(12, 10)
+EARLY = np.tile(np.arange(10) < 7, (12, 1))
 REFUSED = {
     "flat counts": ({"counts": np.ones(12)}, r"\[spots, bins\].*\(12,\)"),
     "no spots": ({"counts": np.ones((0, 10))}, "not empty"),
@@ -53,6 +56,13 @@ REFUSED = {
     "odd scan": ({"scan_shape": (2, 2, 3)}, "does not hold"),
     "repeated order": ({"scan_order": np.zeros(12, dtype=int)}, "permutation of 0 … 11"),
     "short order": ({"scan_order": np.arange(11)}, "permutation"),
+    "few observed": ({"observed": np.ones((12, 9), dtype=bool)}, r"observed must be \[12, 10\].*\(12, 9\)"),
+    "weights for observed": ({"observed": np.ones((12, 10))}, "True and False.*float64"),
+    "counts nobody recorded": ({"observed": EARLY}, "36 bins hold counts but are said not to"),
+    "no gated bin recorded": (
+        {"observed": EARLY, "counts": COUNTS * EARLY, "gate": (7, 10)},
+        r"no bin of the gate \[7, 10\) was recorded",
+    ),
 }
 
 
@@ -116,6 +126,62 @@ def test_sum_spots_by_hand():
     assert np.allclose(capture.sensor, [[-0.15, 0.2, 0], [0.05, 0.2, 0]])
     backwards = dataclasses.replace(Capture(**fields()), scan_order=np.arange(12)[::-1]).sum_spots(2)
     assert backwards.scan_order.tolist() == [1, 0]
+
+
+def partly_recorded() -> Capture:
+    """The small capture of 4 × 3 spots: the second spot lost bins 4 and 5, spot 9 lost all."""
+    observed = np.ones((12, 10), dtype=bool)
+    observed[1, 4:6] = observed[9] = False
+    counts = np.where(observed, np.arange(120, dtype=np.uint16).reshape(12, 10), 0)
+    return Capture(**fields(counts=counts.astype(np.uint16), observed=observed, gate=(2, 9)))
+
+
+def test_a_sum_was_recorded_where_all_its_parts_were():
+    bins = partly_recorded().sum_bins(3)
+    assert bins.observed[1].tolist() == [True, False, True]
+    assert bins.counts[1].tolist() == [10 + 11 + 12, 0, 16 + 17 + 18]
+    spots = partly_recorded().sum_spots(2)
+    assert spots.observed[0].tolist() == [True] * 4 + [False] * 2 + [True] * 4
+    assert not spots.observed[1].any()
+    assert spots.counts[0, 3:6].tolist() == [3 + 13 + 33 + 43, 0, 0]
+
+
+def test_gated_parts_and_means_over_what_was_recorded():
+    capture = partly_recorded()
+    assert capture.gated_observed()[[0, 1]].sum(axis=1).tolist() == [7, 5]
+    assert capture.with_gate(0, 4).gated_observed().sum() == 11 * 4
+    assert Capture(**fields()).gated_observed() is None
+    mean = capture.mean_transient()
+    rows = [r for r in range(12) if r != 9]
+    assert mean[0] == pytest.approx(np.mean([10 * r for r in rows]))
+    assert mean[4] == pytest.approx(np.mean([10 * r + 4 for r in rows if r != 1]))
+
+
+def test_other_counts_stay_zero_where_nothing_was_recorded():
+    drawn = partly_recorded().with_counts(np.full((12, 10), 5), is_counts=False)
+    assert drawn.counts.sum() == 5 * (120 - 12)
+    assert not drawn.is_counts
+    assert (drawn.observed == partly_recorded().observed).all()
+
+
+def test_the_scans_levels_are_those_of_recorded_bins():
+    """A flat capture has the same level of counts, whatever part of it was recorded."""
+    observed = np.ones((12, 10), dtype=bool)
+    observed[:, :2] = observed[3] = observed[4, 5:] = False
+    scan = Scan.of(Capture(**fields(counts=4.0 * observed, observed=observed)))
+    assert scan.background == pytest.approx(4)
+    assert scan.mean_counts == pytest.approx(8 * 4)
+
+
+def test_counts_are_faded_towards_bins_that_were_not_recorded():
+    observed = np.ones((12, 10), dtype=bool)
+    observed[2, :4] = observed[5, 8:] = False
+    capture = Capture(**fields(counts=4.0 * observed, observed=observed))
+    faded = tapered_counts(capture, (3, 10), width=0.2)  # two bins
+    edge = [4 * np.sin(np.pi / 8) ** 2, 4 * np.sin(3 * np.pi / 8) ** 2]
+    assert faded[2].tolist() == pytest.approx([0, *edge, 4, 4, 4, 4])
+    assert faded[5].tolist() == pytest.approx([4, 4, 4, *edge[::-1], 0, 0])
+    assert (np.delete(faded, [2, 5], axis=0) == 4).all()
 
 
 @pytest.mark.parametrize("factor", [0, -1, 11])

@@ -31,6 +31,7 @@ def test_every_format_is_told_and_drawn(tmp_path, capsys, name):
         "time",
         "gate",
         "counts",
+        "recorded",
         "direct pulse",
         "first return",
         "done",
@@ -75,6 +76,29 @@ def test_what_looks_wrong_is_said(tmp_path, capsys, arguments, warning):
     assert inspect_capture([str(_lct(tmp_path)), "--out", str(tmp_path), *arguments]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("LOOK AT")]
     assert any(__import__("re").search(warning, line) for line in lines), lines
+
+
+def test_what_was_not_recorded_is_told_and_is_no_first_return(tmp_path, capsys):
+    path = _lct(tmp_path)
+    data = scipy.io.loadmat(path)["rect_data"]
+    data[2, 3, 700:1201] = 0  # up to the scene's peak
+    data[4, 1] = 0
+    scipy.io.savemat(path, {"rect_data": data, "width": 0.35})
+    assert inspect_capture([str(path), "--gate", "650", "2048", "--out", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    share = (36 * 1398 - 1398 - 501) / (36 * 1398)
+    assert (
+        f"recorded     {share:.1%} of the gate's bins; 1 of 36 spots have none of them, 1 only some" in told
+    )
+    assert "LOOK AT" not in told
+    findings = examine(read_capture(path))
+    assert len(findings.first_returns) == 34
+    assert np.ptp(findings.first_returns) < 0.02
+    assert np.isnan(findings.totals).sum() == 1
+    assert inspect_capture([str(path), "--observed", "all", "--no-counts", "--out", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert "recorded     every bin of the gate" in told
+    assert "expected values, not counts" in told
 
 
 def test_an_error_is_one_sentence_and_status_2(tmp_path):

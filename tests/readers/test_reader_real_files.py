@@ -10,6 +10,7 @@ from conftest import real_file
 from data_modules.readers import ReaderOptions, detect_format, read_capture, write_capture
 
 C = 299_792_458.0
+CHART_SHA = "c4c1392150d024b57029632a5f05d85916ab34fbfea5b953876b189f141d6184"
 RENDERS = [
     ("bunny_confocal_32_d3", "confocal", (32, 32), 1024, 0.006),
     ("bunny_confocal_32_d8", "confocal", (32, 32), 1024, 0.006),
@@ -65,7 +66,11 @@ def test_tals_raw_scale_is_taken_off():
         ("data_s_u", 0.35, "11a94722540e046ba3d86f7c00108948d1781428939302fd0e829d784a7f8f21"),
         ("data_diffuse_s", 0.35, "d0098f6e81e33cc1aab91bbf93962faeeeca3b2c1ef69f78bba16162e282264f"),
         ("data_dot_chart_65cm", 0.2, "1af7d23414fda1e366dc17fdf5f8ac6753b9e71a15c20d31669739278e293f6c"),
-        ("data_resolution_chart_40cm", 0.2, "c4c1392150d024b57029632a5f05d85916ab34fbfea5b953876b189f141d6184"),
+        (
+            "data_resolution_chart_40cm",
+            0.2,
+            "c4c1392150d024b57029632a5f05d85916ab34fbfea5b953876b189f141d6184",
+        ),
     ],
 )
 def test_lct_captures(name, half, sha):

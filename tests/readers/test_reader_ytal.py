@@ -104,6 +104,36 @@ def test_round_trip_is_lossless(tmp_path, kind, h_format):
         assert file["H"].shape[0] == 17
 
 
+def test_what_was_not_recorded_survives_a_round_trip(tmp_path):
+    whole = _capture("exhaustive")
+    observed = np.random.default_rng(4).random(whole.counts.shape) < 0.8
+    capture = dataclasses.replace(whole, counts=whole.counts * observed, observed=observed)
+    path = write_capture(tmp_path / "a.hdf5", capture)
+    np.testing.assert_array_equal(read_capture(path).observed, observed)
+    with h5py.File(path) as file:
+        assert set(file) == TAL_KEYS | {"nlos_lit_observed"}
+        assert file["nlos_lit_observed"].shape == file["H"].shape
+        np.testing.assert_array_equal(file["nlos_lit_observed"][:, 2, 1, 0, 3], observed[43])
+    moved = read_capture(path, options=ReaderOptions(exposure_s=2.0))
+    np.testing.assert_array_equal(moved.observed, observed)
+    assert read_capture(path, options=ReaderOptions(observed="all")).observed is None
+    with h5py.File(path, "r+") as file:
+        file["nlos_lit_observed"][0, 0, 0, 0, 0] = 2
+    with pytest.raises(CaptureError, match=r"nlos_lit_observed in a.hdf5 must be 0 or 1 for each value of H"):
+        read_capture(path)
+
+
+@pytest.mark.parametrize(
+    ("values", "said", "counts"),
+    [(3.0, None, True), (3.5, None, False), (3.0, False, False), (3.5, True, True)],
+)
+def test_whole_numbers_are_counts_unless_the_user_says_otherwise(tmp_path, values, said, counts):
+    path = files.ytal(tmp_path, H=np.full((60, 3, 2), values, dtype=np.float32))
+    capture = read_capture(path, options=ReaderOptions(counts=said))
+    assert capture.is_counts == counts
+    assert any("as asked" in step for step in capture.provenance["steps"]) == (said is not None)
+
+
 def test_the_written_array_has_tals_axes(tmp_path):
     capture = _capture("exhaustive")
     with h5py.File(write_capture(tmp_path / "a.hdf5", capture)) as file:
