@@ -1,8 +1,9 @@
 """Simulate a capture of a hidden scene: ``python simulate.py scene=letters out=letters.hdf5 nx=64 ny=64``.
 
-Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen from
-the wall, and the mesh. With physical effects: ``python simulate.py scene=letters effects=[pile_up]
-pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
+Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen
+from the wall, and the mesh. A scene of one's own: ``'bodies=[{kind: cone, at: [0, 0, 0.6]}]'``; one drawn
+at random: ``random=7`` (docs/simulator.md). With physical effects: ``python simulate.py scene=letters
+effects=[pile_up] pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
 """
 
 import logging

@@ -247,7 +247,7 @@ class Fold(Body):
     Args:
         width: of the sheet along its panels, m.
         height: along the creases, m.
-        creases: how many.
+        creases: how many, up to 100.
         angle: between neighbouring panels, degrees: 180 is flat; below, the first crease points to the wall,
             above, away from it.
     """
@@ -263,6 +263,8 @@ class Fold(Body):
         super().__post_init__()
         if not 0 < self.angle < 360:
             raise UserError(f"angle must lie between 0 and 360 degrees; found {self.angle!r}")
+        if self.creases > 100:
+            raise UserError(f"creases may be 100 at most; found {self.creases}")
 
     def shape(self) -> Mesh:
         """Creases along y, the middle of its depth at 0."""
@@ -365,7 +367,7 @@ class Person(Body):
 
     def shape(self) -> Mesh:
         """Upright, its breast towards the wall."""
-        return shapes.person(self.height, *np.deg2rad([self.arms, self.stride]), cell=self.cell)
+        return shapes.person(self.height, math.radians(self.arms), math.radians(self.stride), self.cell)
 
 
 BODIES: tuple[type[Body], ...] = (
@@ -426,7 +428,7 @@ def _value(key: str, value: object, default: object) -> Any:
         if isinstance(value, bool):
             raise UserError(f"{key} must be text; found {value}; write it in quotes")
         return str(value)
-    numbers = value if isinstance(value, (list, tuple)) else [value]
+    numbers: Any = value if isinstance(value, (list, tuple)) else [value]
     wanted = len(default) if isinstance(default, tuple) else 1
     pair = key == "albedo" and len(numbers) == 2
     if (len(numbers) != wanted and not pair) or not all(
@@ -434,7 +436,7 @@ def _value(key: str, value: object, default: object) -> Any:
     ):
         raise UserError(f"{key} must be {'a number' if wanted == 1 else f'{wanted} numbers'}; found {value}")
     if isinstance(default, int):
-        if numbers[0] != int(numbers[0]):
+        if not float(numbers[0]).is_integer():
             raise UserError(f"{key} must be a whole number; found {value}")
         return int(numbers[0])
     as_floats = tuple(map(float, numbers))
@@ -449,8 +451,14 @@ def bodies_from(configs: Iterable[object]) -> tuple[Body, ...]:
 
     Returns:
         the bodies, in that order.
+
+    Raises:
+        UserError: there are none, or one makes no sense.
     """
-    return tuple(body_from(config, f"body {i}") for i, config in enumerate(configs, 1))
+    bodies = tuple(body_from(config, f"body {i}") for i, config in enumerate(configs, 1))
+    if not bodies:
+        raise UserError(f"found no bodies; give at least one of the kinds {', '.join(KINDS)}")
+    return bodies
 
 
 def one_line(bodies: Iterable[Body]) -> str:

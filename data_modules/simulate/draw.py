@@ -284,7 +284,8 @@ def _placed(rng: np.random.Generator, body: Body, others: list[Body], meshes: li
 def _moved(body: Body, place: np.ndarray) -> Body:
     import dataclasses
 
-    return dataclasses.replace(body, at=tuple(float(f"{v:.4f}") for v in place))
+    x, y, z = (float(f"{v:.4f}") for v in place)
+    return dataclasses.replace(body, at=(x, y, z))
 
 
 def way_to_touch(mesh: Mesh, other: Mesh, direction: np.ndarray) -> float:

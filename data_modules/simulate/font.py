@@ -84,6 +84,6 @@ def lines(text: str, size: float, gap: float) -> list[np.ndarray]:
     drawn = []
     for i, letter in enumerate(text):
         for line in filter(None, GLYPHS[letter].split("|")):
-            points = np.array([[int(x), int(y)] for x, y in line.split()], dtype=np.float64)
+            points = np.array([[int(point[0]), int(point[1])] for point in line.split()], dtype=np.float64)
             drawn.append(points * step + [i * advance, 0.0] - middle)
     return drawn

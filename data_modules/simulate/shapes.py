@@ -10,10 +10,13 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from data_modules.simulate.mesh import Mesh, join
+from nlos_lit.capture.errors import UserError
 
 FEWEST_SEGMENTS = 24  # around a round body, however thin
+MOST_STEPS = 2000  # along any line of a body
 
 
 def steps(length: float, cell: float) -> int:
@@ -26,10 +29,17 @@ def steps(length: float, cell: float) -> int:
     Returns:
         1 or more.
 
+    Raises:
+        UserError: they are thousands.
+
     Examples:
         >>> steps(0.1, 0.03), steps(0.1, 1.0)
         (4, 1)
     """
+    if length > MOST_STEPS * cell:
+        raise UserError(
+            f"cell={cell:g} cuts {length:g} m into {length / cell:.3g} pieces; {MOST_STEPS} are the most"
+        )
     return max(1, int(np.ceil(length / cell - 1e-9)))
 
 
@@ -216,7 +226,7 @@ def pen(lines: Sequence[np.ndarray], width: float, cell: float) -> Mesh:
     """
     ends = np.concatenate(lines)
     low = ends.min(axis=0) - width / 2 - 1.5 * cell
-    shape = np.ceil((ends.max(axis=0) + width / 2 + 1.5 * cell - low) / cell).astype(int) + 1
+    shape = [steps(length, cell) + 1 for length in ends.max(axis=0) + width / 2 + 1.5 * cell - low]
     i, j = (n.ravel() for n in np.meshgrid(*map(np.arange, shape), indexing="ij"))
     points = low + cell * np.stack([i, j], axis=1)
     distance = np.full(len(points), np.inf)
@@ -287,7 +297,7 @@ def capsule_profile(radius: float, length: float, cell: float) -> np.ndarray:
     return np.concatenate([upper, middle, lower if length else lower[1:]])
 
 
-def limb(start: Sequence[float], end: Sequence[float], radius: float, cell: float) -> Mesh:
+def limb(start: ArrayLike, end: ArrayLike, radius: float, cell: float) -> Mesh:
     """A capsule between two points.
 
     Args:

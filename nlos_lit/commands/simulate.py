@@ -58,7 +58,7 @@ class Options:
     """
 
     scene: str = "default"
-    bodies: tuple[Any, ...] = ()
+    bodies: tuple[Any, ...] | None = None
     random: int | None = None
     mesh: str | None = None
     out: str | None = None
@@ -72,8 +72,10 @@ class Options:
     def __post_init__(self) -> None:
         if not 0 < self.exposure < float("inf"):
             raise UserError(f"exposure must be above 0; found {self.exposure}")
-        given = {"scene": self.scene != "default", "bodies": self.bodies, "random": self.random is not None}
-        named = [name for name, is_given in given.items() if is_given]
+        if self.random is not None and self.random < 0:
+            raise UserError(f"random is a seed, 0 or above; found {self.random}")
+        named = ["scene"] if self.scene != "default" else []
+        named += [name for name in ("bodies", "random") if getattr(self, name) is not None]
         if len(named) > 1:
             raise UserError(f"found {' and '.join(named)}; each is a whole scene, so give one of them")
         if self.mesh is not None and named != ["scene"]:
@@ -157,8 +159,11 @@ def build(options: Options) -> tuple[Mesh, tuple[Body, ...]]:
     Raises:
         UserError: there is no such scene or body, or no file where one is needed.
     """
-    if options.bodies or options.random is not None:
-        bodies = bodies_from(options.bodies) if options.random is None else draw_scene(options.random).bodies
+    if options.random is not None:
+        drawn = draw_scene(options.random)
+        return drawn.mesh(), drawn.bodies
+    if options.bodies is not None:
+        bodies = bodies_from(options.bodies)
         return assemble(bodies), bodies
     scene, mesh = options.scene, options.mesh
     if scene in SCENES and mesh is None:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from conftest import ROOT
 from numpy import pi
 
 from data_modules.simulate.bodies import (
@@ -286,6 +287,8 @@ def test_a_body_comes_back_from_its_config(body):
         ({"kind": "cone", "top": -0.1}, "top must be 0 or above"),
         ({"kind": "torus", "tube": 0.2}, "tube must be below radius; found 0.2 and 0.12"),
         ({"kind": "fold", "creases": 1.5}, "creases must be a whole number; found 1.5"),
+        ({"kind": "fold", "creases": float("inf")}, "creases must be a whole number; found inf"),
+        ({"kind": "fold", "creases": 101}, "creases may be 100 at most; found 101"),
         ({"kind": "fold", "angle": 0}, "angle must lie between 0 and 360"),
         ({"kind": "bend", "angle": 0}, "angle must lie within"),
         ({"kind": "text", "text": "Hi!"}, "no strokes for ! i"),
@@ -300,6 +303,12 @@ def test_configs_that_make_no_sense_are_explained(config, words):
         bodies_from([config])
 
 
+@pytest.mark.parametrize("kind", ["sphere", "cylinder", "torus", "bend", "text", "person"])
+def test_cells_too_fine_to_hold_are_refused(kind):
+    with pytest.raises(UserError, match=r"cell=1e-06 cuts .* pieces; 2000 are the most"):
+        body_from({"kind": kind, "cell": 1e-6}).shape()
+
+
 def test_textures_too_fine_to_cut_are_refused():
     fine = Plate(texture="stripes", albedo=(0.2, 0.9), period=0.001)
     with pytest.raises(UserError, match="600 steps across the body; give 500 at most"):
@@ -309,3 +318,14 @@ def test_textures_too_fine_to_cut_are_refused():
 def test_a_line_names_what_differs_from_the_defaults():
     line = one_line([Torus(tube=0.05, turn=(0, 30, 0)), Text(text="NO")])
     assert line == "bodies=[{kind: torus, turn: [0, 30, 0], tube: 0.05}, {kind: text, text: 'NO'}]"
+
+
+def test_the_page_names_every_kind_and_key_with_its_default():
+    page = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+    rows = {row.split("|")[1].strip(" `"): row for row in page.splitlines() if row.startswith("| `")}
+    shared = {field.name for field in dataclasses.fields(Body)}
+    assert shared <= set(rows)
+    for body in BODIES:
+        for field in dataclasses.fields(body):
+            default = f"{field.default:g}" if isinstance(field.default, float) else field.default
+            assert field.name in shared or f"`{field.name}: {default}`" in rows[body.kind]

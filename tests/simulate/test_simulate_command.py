@@ -113,6 +113,8 @@ def test_arguments_that_make_no_sense_are_explained(arguments, words):
         ({"bodies": ({"kind": "sphere"},), "mesh": "x.obj"}, "without scene=mesh"),
         ({"bodies": ({"kind": "sphere"},), "random": 0}, "found bodies and random; .* give one of them"),
         ({"bodies": ({"kind": "sphere"},), "scene": "letters"}, "found scene and bodies"),
+        ({"bodies": ()}, "found no bodies; give at least one"),
+        ({"random": -1}, "random is a seed, 0 or above; found -1"),
         ({"bodies": ({"kind": "cube"},)}, "body 1 has no known kind"),
     ],
 )
