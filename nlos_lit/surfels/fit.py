@@ -262,15 +262,15 @@ class SurfelFit:
         Raises:
             UserError: it is the state of a fit with other effects.
         """
-        device, state = self.counts.device, copy.deepcopy(state)
-        for name in ("order", "place", "tested", "done", "more", "before", "history", "losses"):
-            setattr(self, name, state[name])
         own, kept = self.extension.state_dict().keys(), state["extension"].keys()
         if own != kept:
             raise UserError(
                 f"the kept surface fit has effects with {sorted(kept) or 'nothing'}, this one with "
                 f"{sorted(own) or 'nothing'}; go on with the same effects, or begin anew"
             )
+        device, state = self.counts.device, copy.deepcopy(state)
+        for name in ("order", "place", "tested", "done", "more", "before", "history", "losses"):
+            setattr(self, name, state[name])
         self.model = SurfelModel.from_state(self.capture, state["model"])
         self.extension.load_state_dict(state["extension"])
         self.reserve, self.generator = Seeds(*state["reserve"]), torch.Generator()
@@ -278,20 +278,27 @@ class SurfelFit:
         self.plan = [Round(*each) for each in state["plan"]]
         self.optimizer = None
         self.to(device)
-        self.model.pairs = tuple(part.to(device) for part in state["pairs"])
+        self._link(state["pairs"], device)
         if state["optimizer"] is not None:
             self.optimizer = self._new_optimizer()
             for parameter, moments in zip(_parameters(self.optimizer), state["optimizer"], strict=True):
                 if moments:
-                    self.optimizer.state[parameter] = {n: v.to(device) for n, v in moments.items()}
+                    # Adam counts its steps on the CPU, wherever its moments are.
+                    self.optimizer.state[parameter] = {
+                        name: value.to(device) if value.dim() else value for name, value in moments.items()
+                    }
 
     def to(self, device: torch.device | str) -> None:
-        """Move surfels, effects and counts; between rounds, or before anything has been fitted."""
+        """Move surfels, effects and counts; an optimiser that is under way stays where it is."""
         self.model.to(device)
         self.extension.to(device)
         self.counts, self.train = self.counts.to(device), self.train.to(device)
         self.reserve = Seeds(*(part.to(device) for part in self.reserve))
-        self.model.pairs = tuple(part.to(device) for part in self.model.pairs)
+        self._link(self.model.pairs, device)
+
+    def _link(self, pairs: tuple[Tensor, Tensor], device: torch.device | str) -> None:
+        first, second = pairs
+        self.model.pairs = first.to(device), second.to(device)
 
     @torch.no_grad()
     def match_energy(self) -> None:
