@@ -127,6 +127,8 @@ class CaptureFit(L.LightningModule):
 
     def _add_score(self, batch: dict[str, Tensor]) -> None:
         counts, expected = batch["counts"], self.expected(batch["spots"])
+        if "observed" in batch:
+            counts, expected = counts[batch["observed"]], expected[batch["observed"]]
         noise = expected_deviance(expected) * counts.numel()
         floor = nmse_noise_floor(counts) * (counts.double() ** 2).sum()
         self._sums += torch.stack(

@@ -102,10 +102,36 @@ def test_su_as_its_config_says():
     assert capture.bin_width_ps == pytest.approx(16)
 
 
+@pytest.mark.parametrize(
+    ("name", "file", "path"),
+    [("dot_chart", "data_dot_chart_65cm", 1.3), ("resolution_chart", "data_resolution_chart_40cm", 0.8)],
+)
+def test_charts_as_their_configs_say(name, file, path):
+    """The mean transient in the gate rises within 5 cm of twice the distance in the file's name."""
+    said = scene(name, f"scene.path={real_file(f'measured/{file}.mat')}")
+    capture, _ = load_scene(said, "data", seed=0)
+    first, last = capture.gate
+    mean = capture.mean_transient()[first:last]
+    rise = first + int(np.argmax(mean > (mean[:4].mean() + mean.max()) / 2))
+    assert capture.observed is None
+    assert capture.t_start + rise * capture.bin_length == pytest.approx(path, abs=0.05)
+    near, far = said["volume"]["depth"]
+    assert near < path / 2 < far
+
+
 def test_figure_4_as_its_config_says():
     capture, _ = load_scene(scene("figure_4", f"scene.path={real_file('measured/figure_4')}"), "data", seed=0)
     assert capture.kind == "single_sensor"
     assert capture.bin_width_ps == pytest.approx(16)
+    assert (~capture.observed[:, 300:499].any(axis=1)).sum() == 100
+
+
+def test_the_readers_options_come_from_the_scene(tmp_path):
+    capture, _ = load_scene(scene("default", *SMALL), tmp_path, seed=0)
+    write_capture(tmp_path / "x.hdf5", capture)
+    options = ("scene.reader.counts=false", "scene.reader.observed=all")
+    read, _ = load_scene(scene("capture", f"scene.path={tmp_path}/x.hdf5", *options), tmp_path, seed=0)
+    assert (read.is_counts, read.observed) == (False, None)
 
 
 def test_a_render_with_its_truth():

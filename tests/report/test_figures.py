@@ -164,6 +164,21 @@ def test_transients_have_one_panel_a_spot(spots):
     np.testing.assert_allclose(upper.get_xlim(), np.array([0.9, 1.19]) / 0.299792458)
 
 
+def test_what_was_not_recorded_is_a_shaded_gap_in_the_measured_transient():
+    observed = np.ones((2, 30), dtype=bool)
+    observed[1, 5:9] = False
+    figure = figures.transients_plot(
+        np.ones((2, 30)), np.ones((2, 30)), np.arange(30.0), ["whole", "cut"], observed=observed
+    )
+    whole, cut = figure.axes[:2]
+    assert np.isfinite(whole.lines[0].get_ydata()).all()
+    assert np.flatnonzero(np.isnan(cut.lines[0].get_ydata())).tolist() == [5, 6, 7, 8]
+    assert [len(axes.collections) for axes in (whole, cut)] == [0, 1]
+    reach = cut.collections[0].get_paths()[0].vertices[:, 0]
+    assert 4 <= reach.min() <= 5
+    assert 8 <= reach.max() <= 9
+
+
 def test_response_axes():
     figure = figures.laser_sensor_plot(np.array([0.1, 0.6, 0.3]), bin_length=0.006, first=-0.006)
     pixels(figure)

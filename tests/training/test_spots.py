@@ -137,6 +137,16 @@ def test_batches_hold_the_gated_counts_of_their_spots():
     assert batch["spots"].tolist() == [5, 2]
 
 
+def test_batches_say_what_was_recorded_where_not_all_was():
+    whole = capture()
+    assert "observed" not in module(whole).dataset[[0]]
+    observed = np.ones((64, 4), dtype=bool)
+    observed[5, 2:] = observed[9] = False
+    data = module(dataclasses.replace(whole, counts=whole.counts * observed, observed=observed).with_gate(1))
+    assert data.dataset[[5, 2]]["observed"].tolist() == [[True, False, False], [True] * 3]
+    assert 9 not in [*data.train_spots, *data.heldout_spots]
+
+
 def test_spots_without_counts_are_left_out():
     whole = capture()
     counts = whole.counts.copy()
