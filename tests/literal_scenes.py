@@ -33,7 +33,7 @@ class Case:
     conserve: bool
     subtract: bool
     gate: tuple[int, int] = (0, BINS)
-    refine: int = 1
+    upsample: int = 1
     fine: int | None = None  # the package's own depth search (with a relative β) instead of the paper's
     seed: int = 0
 
@@ -46,7 +46,7 @@ CASES = {
     "exhaustive": Case("exhaustive", 2, 0, "free", 0.05, False, True, seed=15),
     "curved wall": Case("curved", 1, 0, "free", 0.3, True, False, gate=(0, 118), seed=5),
     "irregular spots": Case("irregular", 2, 1, "residual", 0.06, True, True, seed=6),
-    "refined": Case("confocal", 1, 2, "free", 0.25, False, True, refine=2, seed=7),
+    "upsampled": Case("confocal", 1, 2, "free", 0.25, False, True, upsample=2, seed=7),
     "fine": Case("confocal", 1, 2, "free", 0.2, True, True, fine=4, seed=12),
 }
 
@@ -116,7 +116,7 @@ def build(case: Case) -> SimpleNamespace:
     elif shape is None:
         grid = VolumeGrid((-0.24, -0.26, 0.37), (0.068, 0.062, 0.021), (22, 8, 9))
     else:
-        grid = volume_grid(capture, depth=(0.37, 0.82), depth_pitch=0.021, refine=case.refine)
+        grid = volume_grid(capture, depth=(0.37, 0.82), depth_pitch=0.021, upsample=case.upsample)
     bounds = SimpleNamespace(
         omega_pf=(42.0, 15.0, 70.0), sigma_pf=(0.15, 0.06, 0.3), sigma_ls=(0.03, 0.016, 0.1),
         I_l=(4.0e4, 1.0, 1e6), kappa_s=(40.0, 5.0, 200.0), eta_s=(8.0, 0.1, 100.0),

@@ -60,12 +60,12 @@ def volume_grid(
     *,
     depth: tuple[float, float],
     depth_pitch: float | None = None,
-    refine: int = 1,
+    upsample: int = 1,
     lateral: tuple[int, int] | None = None,
 ) -> VolumeGrid:
     """The voxels to image through a capture's wall.
 
-    Laterally they are the scan's lattice, refined and extended on request; a scan that is no lattice gets
+    Laterally they are the scan's lattice, made finer and extended on request; a scan that is no lattice gets
     √S × √S voxels over the rectangle of its wall points.
 
     Args:
@@ -73,7 +73,7 @@ def volume_grid(
         depth: nearest and farthest voxel plane, m from the wall.
         depth_pitch: spacing of planes, m; None takes half a bin length, which is one bin of path there and
             back.
-        refine: voxels per lattice step.
+        upsample: voxels per lattice step.
         lateral: numbers of voxels along x and y, centred on the scan; None covers the scan.
 
     Returns:
@@ -89,7 +89,7 @@ def volume_grid(
         >>> wall = np.stack([x.ravel(), y.ravel(), np.zeros(4)], axis=1)
         >>> up = np.tile([0.0, 0.0, 1.0], (4, 1))
         >>> capture = Capture(np.ones((4, 100)), wall, wall, up, up, bin_length=0.02, scan_shape=(2, 2))
-        >>> grid = volume_grid(capture, depth=(0.5, 0.7), depth_pitch=0.05, refine=2)
+        >>> grid = volume_grid(capture, depth=(0.5, 0.7), depth_pitch=0.05, upsample=2)
         >>> grid.shape, grid.pitch
         ((5, 4, 4), (0.05, 0.05, 0.05))
     """
@@ -99,8 +99,8 @@ def volume_grid(
             f"the volume's depth must satisfy 0 < nearest < farthest; found [{near:g}, {far:g}] m"
         )
     pitch_z = capture.bin_length / 2 if depth_pitch is None else float(depth_pitch)
-    if pitch_z <= 0 or refine < 1:
-        raise UserError(f"the depth pitch ({pitch_z:g} m) and the refinement ({refine}) must be positive")
+    if pitch_z <= 0 or upsample < 1:
+        raise UserError(f"the depth pitch ({pitch_z:g} m) and upsample ({upsample}) must be positive")
     nz = max(2, math.floor((far - near) / pitch_z + 1e-6) + 1)
     geometry = scan_geometry(capture)
     first: tuple[float, ...]
@@ -118,9 +118,9 @@ def volume_grid(
         first, counts = tuple(float(v) for v in low), (side, side)
         if min(steps) <= 0:
             raise UserError("the spots lie on one line; a volume needs spots spread over the wall in x and y")
-    fine_x, fine_y = (s / refine for s in steps)
-    nx, ny = (int(n) for n in lateral) if lateral is not None else (n * refine for n in counts)
-    skip_x, skip_y = ((w - (n - 1) * refine - 1) // 2 for w, n in zip((nx, ny), counts, strict=True))
+    fine_x, fine_y = (s / upsample for s in steps)
+    nx, ny = (int(n) for n in lateral) if lateral is not None else (n * upsample for n in counts)
+    skip_x, skip_y = ((w - (n - 1) * upsample - 1) // 2 for w, n in zip((nx, ny), counts, strict=True))
     origin = (first[0] - skip_x * fine_x, first[1] - skip_y * fine_y, first[2] + near)
     grid = VolumeGrid(origin, (fine_x, fine_y, pitch_z), (nz, nx, ny))
     path_range(capture, grid)

@@ -64,10 +64,10 @@ class PhasorPlan:
 
 @dataclass(frozen=True)
 class LatticeLayout:
-    """Voxels on the scan's lattice: ``refine`` voxels a step, ``offset`` voxels from its first point."""
+    """Voxels on the scan's lattice: ``upsample`` voxels a step, ``offset`` voxels from its first point."""
 
     geometry: ScanGeometry
-    refine: int
+    upsample: int
     offset: tuple[int, int]
     padded_points: int  # of the zero-padded transform
 
@@ -185,7 +185,7 @@ class PhasorImaging(nn.Module):
         else:
             spectra = 8 * n_freq * layout.padded_points * len(layout.geometry.rows)
             propagating = spectra + max(
-                16 * n_freq * capture.n_spots * layout.refine**2, layout.plane_bytes(n_freq, rank)
+                16 * n_freq * capture.n_spots * layout.upsample**2, layout.plane_bytes(n_freq, rank)
             )
         # Transients and spectra are gone when planes are propagated.
         reading, working = reading + _SCRATCH, propagating + _SCRATCH
@@ -324,28 +324,28 @@ class PhasorImaging(nn.Module):
         if geometry is None:
             return None
         lattice, grid = geometry.lattice, self.grid
-        refine = round(lattice.pitch[0] / grid.pitch[0])
+        upsample = round(lattice.pitch[0] / grid.pitch[0])
         steps = [(grid.origin[a] - lattice.origin[a]) / grid.pitch[a] for a in (0, 1)]
         offset = (round(steps[0]), round(steps[1]))
         apart = max(abs(step - whole) for step, whole in zip(steps, offset, strict=True))
-        stretch = max(abs(lattice.pitch[a] / grid.pitch[a] - refine) * grid.shape[1 + a] for a in (0, 1))
-        if refine < 1 or apart + stretch > ALIGNED:
+        stretch = max(abs(lattice.pitch[a] / grid.pitch[a] - upsample) * grid.shape[1 + a] for a in (0, 1))
+        if upsample < 1 or apart + stretch > ALIGNED:
             return None
-        sizes = [(n - 1) * refine + 1 for n in lattice.shape]
+        sizes = [(n - 1) * upsample + 1 for n in lattice.shape]
         padded = [convolution_length(n, m, o) for n, m, o in zip(sizes, grid.shape[1:], offset, strict=True)]
-        return LatticeLayout(geometry, refine, offset, padded[0] * padded[1])
+        return LatticeLayout(geometry, upsample, offset, padded[0] * padded[1])
 
     def _lattice(self, layout: LatticeLayout, spectrum: Tensor, planes: slice) -> Iterator[Tensor]:
-        geometry, refine = layout.geometry, layout.refine
+        geometry, upsample = layout.geometry, layout.upsample
         nx, ny = geometry.lattice.shape
         field = (
             spectrum[:, torch.from_numpy(geometry.rows)]
             .permute(1, 0, 2)
             .reshape(len(geometry.rows), -1, nx, ny)
         )
-        if refine > 1:
-            sparse = field.new_zeros(*field.shape[:2], (nx - 1) * refine + 1, (ny - 1) * refine + 1)
-            sparse[:, :, ::refine, ::refine] = field
+        if upsample > 1:
+            sparse = field.new_zeros(*field.shape[:2], (nx - 1) * upsample + 1, (ny - 1) * upsample + 1)
+            sparse[:, :, ::upsample, ::upsample] = field
             field = sparse
         plane = geometry.lattice.origin[2]
         fixed = None

@@ -18,6 +18,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
@@ -108,6 +109,9 @@ def run_config(folder: str | Path) -> dict[str, Any]:
         for name in ("model", "surfels")
         for key in set(config.get(name, ())) - {field.name for field in dataclasses.fields(SETTINGS[name])}
     }
+    if "scene" in config:
+        grid = inspect.signature(volume_grid).parameters
+        unread |= {f"scene.volume.{key}" for key in set(config["scene"]["volume"]) - set(grid)}
     if missing or unread:
         found = [*(f"no {name}" for name in sorted(missing)), *sorted(unread)]
         raise UserError(

@@ -20,7 +20,7 @@ def test_volume_grid_over_the_scan():
     assert np.allclose(
         [grid.x[0], grid.x[-1], grid.y[0], grid.y[-1], grid.z[0], grid.z[-1]], [-0.2, 0.1, 0.1, 0.5, 0.3, 0.5]
     )
-    fine = volume_grid(capture, depth=(0.3, 0.5), depth_pitch=0.1, refine=2, lateral=(9, 3))
+    fine = volume_grid(capture, depth=(0.3, 0.5), depth_pitch=0.1, upsample=2, lateral=(9, 3))
     assert fine.pitch == pytest.approx((0.05, 0.1, 0.1))
     assert np.allclose([fine.x.mean(), fine.y.mean()], [-0.05, 0.3])
     assert np.allclose(np.mod((fine.x + 0.2) / 0.05 + 1e-9, 1), 0, atol=1e-6)
@@ -35,7 +35,7 @@ def test_volume_grid_over_the_scan():
         ({"depth": (0.5, 0.5)}, r"0 < nearest < farthest; found \[0.5, 0.5\]"),
         ({"depth": (-0.1, 0.5)}, "nearest < farthest"),
         ({"depth": (0.3, 0.5), "depth_pitch": 0.0}, "must be positive"),
-        ({"depth": (0.3, 0.5), "refine": 0}, r"refinement \(0\)"),
+        ({"depth": (0.3, 0.5), "upsample": 0}, r"upsample \(0\)"),
         ({"depth": (5.0, 6.0)}, r"outside the capture's time window.*0.5 to 1.5.*0.25 to 0.75"),
         ({"depth": (0.01, 0.05)}, "outside the capture's time window"),
     ],

@@ -38,7 +38,7 @@ def test_compact_by_hand():
     assert (places.tolist(), used.tolist(), needed.tolist()) == ([1, 2], [True, True], [3])
 
 
-@pytest.mark.parametrize("name", ["fine", "confocal, mirrored", "one sensor", "one laser", "refined"])
+@pytest.mark.parametrize("name", ["fine", "confocal, mirrored", "one sensor", "one laser", "upsampled"])
 def test_fixed_sizes_change_nothing(name):
     made = world(name)
     expected, gradients = loss_and_gradients(made)

@@ -186,10 +186,10 @@ def test_half_precision_storage(name):
 def test_streamed_field_gives_the_same(rows, monkeypatch):
     """From a file, in one slab or in many, loss and gradients are those of the field in memory."""
     monkeypatch.setattr("nlos_lit.functional.streamed.SLAB_BYTES", 8 * 30 * rows)
-    world = build(CASES["refined"])
+    world = build(CASES["upsampled"])
     phasor = world.pipeline.phasor
     plan = replace(phasor.plan(world.capture, 1 << 32), on_disk=True)
-    stored, streamed = both("refined")[1], run_package(world, plan=plan)
+    stored, streamed = both("upsampled")[1], run_package(world, plan=plan)
     assert phasor.field.numel() == 0
     assert literal.relative(streamed.rendering.intensity, stored.rendering.intensity) < 1e-6
     for name in NAMES:

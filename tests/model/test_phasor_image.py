@@ -89,7 +89,7 @@ def test_a_scatterer_is_imaged_where_it_is(kind):
     counts[np.arange(len(path)), np.floor((path - t_start) / bin_length).astype(int)] = 100
     normal = np.tile(NORMAL, (len(path), 1))
     capture = Capture(counts, laser, sensor, normal, normal, bin_length, t_start, scan_shape=shape)
-    grid = volume_grid(capture, depth=(0.3, 0.8), depth_pitch=0.01, refine=2)
+    grid = volume_grid(capture, depth=(0.3, 0.8), depth_pitch=0.01, upsample=2)
     phasor = imaging(grid, sigma=0.05)
     plan = phasor.plan(capture, 1 << 32)
     assert plan.method == "lattice"

@@ -320,9 +320,11 @@ def test_a_folder_of_another_version_is_one_sentence(tmp_path):
     assert run_config(tmp_path) == config
     old = {**config, "model": {**config["model"], "clip": None, "rates": {}}}
     del old["objective"]
+    old["scene"] = {**config["scene"], "volume": {**config["scene"]["volume"], "refine": 1}}
     OmegaConf.save(OmegaConf.create(old), tmp_path / "config.yaml")
     with pytest.raises(
-        UserError, match=r"another version .* \(it has no objective, model.clip, model.rates\)"
+        UserError,
+        match=r"another version .* \(it has no objective, model.clip, model.rates, scene.volume.refine\)",
     ):
         run_config(tmp_path)
 

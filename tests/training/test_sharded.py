@@ -25,7 +25,7 @@ SCANS = {
     "uneven slabs": "exhaustive",
     "residual albedo": "one sensor",
     "direct sum": "curved wall",
-    "streamed": "refined",
+    "streamed": "upsampled",
 }
 TOLERANCE = {
     "volume": 0.0,
@@ -71,7 +71,7 @@ def prepared(name: str, shards: int):
     made = build(CASES[name])
     phasor = made.pipeline.phasor
     plan = phasor.plan(made.capture, 1 << 32, shards)
-    phasor.prepare(made.capture, replace(plan, on_disk=name == "refined"))
+    phasor.prepare(made.capture, replace(plan, on_disk=name == "upsampled"))
     made.spots = torch.arange(4) * 9 + 2
     made.counts = torch.from_numpy(made.capture.gated_counts())[made.spots]
     return made
