@@ -33,8 +33,8 @@ def find_unrecorded(counts: np.ndarray, cropped: bool = False) -> tuple[np.ndarr
     Their counts there (the weakest of them but for one in a thousand, times this spot's level in the bins
     outside the run, at most 1) are λ, and zeros have the probability exp(-λ). Dark spots and low counts give
     a small λ and stay. Where more than one in a thousand of the others is itself without counts for half as
-    long, in bins that overlap the run's, light may merely come later or end sooner at this spot, and its
-    zeros stay too. A spot without any count is compared by the others' totals.
+    long, no further away than that, light may merely come later or end sooner at this spot, and its zeros
+    stay too. A spot without any count is compared by the others' totals.
 
     Bins that are empty in every spot are left as they are, since nothing tells them from the time before the
     first light, unless the format is known to cut its captures.
@@ -141,10 +141,11 @@ def _found(counts: np.ndarray, zeros: _Runs, enough: float) -> _Runs:
 
 
 def _dark_beside(zeros: _Runs, others: np.ndarray, first: int, last: int) -> bool:
-    """Whether zeros for half as long as ``[first, last)``, overlapping it, are no rarity in other spots."""
-    near = (2 * zeros.length >= last - first) & (zeros.last > first) & (zeros.first < last)
+    """Whether zeros for half as long as ``[first, last)``, near it, are no rarity in other spots."""
+    half = (last - first) / 2
+    near = (zeros.length >= half) & (zeros.last > first - half) & (zeros.first < last + half)
     dark = np.unique(zeros.spot[near & others[zeros.spot]])
-    return len(dark) > UNLIKE * np.count_nonzero(others)
+    return len(dark) > UNLIKE * int(np.count_nonzero(others))
 
 
 def _words(found: _Runs, whole: tuple[int, int], spots: int) -> list[str]:

@@ -282,7 +282,7 @@ class Capture:
         wide = np.uint64 if self.counts.dtype.kind in "uib" else np.float64
         summed, observed = parts(self.counts).sum(axis=2, dtype=wide), self.observed
         if observed is not None:
-            observed = parts(observed).all(axis=2)
+            observed = np.asarray(parts(observed).all(axis=2))
             summed[~observed] = 0
         gate = (-(-self.gate[0] // factor), min(self.gate[1] // factor, bins))
         step = f"summed {factor} bins into one"
