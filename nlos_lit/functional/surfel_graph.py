@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
+
+NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to exp(-1/2)
+RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present normal by far, none do not
+STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the places
+BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
+STEP = 0.2  # of ln(albedo): smaller differences cost little
+FAINT = 0.03  # of the mean albedo
 
 
 def neighbour_pairs(
@@ -41,29 +50,115 @@ def neighbour_pairs(
     return torch.cat(first), torch.cat(second)
 
 
-def bending(
-    centre: Tensor,
-    normal: Tensor,
-    weight: Tensor,
-    pairs: tuple[Tensor, Tensor],
-    crease: float = 0.5,
-    stiffness: float = 0.05,
-) -> Tensor:
-    """How badly neighbours fit one surface: ``Σ w r²/(1 + r²/c²)`` over pairs.
+class Sheet(NamedTuple):
+    """How the normal of each of M surfels follows from the places of its neighbours, while these move."""
 
-    The robust loss is that of Geman and McClure (1987): an edge costs no more than c².
+    pairs: tuple[Tensor, Tensor]  # i and j [P], from neighbour_pairs
+    normal: Tensor  # [M, 3] unit, about which surfaces lean
+    first: Tensor  # [M, 3] unit, across the normal
+    second: Tensor  # [M, 3] unit, across both
+    share: Tensor  # [P, 2] slopes along both, per metre that j stands out of i's plane
 
-    ``r² = (n̄·d)² + stiffness·|n_i - n_j|²/4``, n̄ the mean of the two normals, d the unit vector between the
-    centres. On any arc of constant curvature n̄·d = 0, so curved surfaces are not flattened, but normals
-    cannot turn without the places following.
+
+def lay_sheet(
+    centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor], cell: float
+) -> Sheet:
+    """Planes through the neighbours of each surfel, by weighted least squares.
+
+    Neighbours count less with their distance and with how far they stand out of the surfel's own plane; a
+    surfel with few of them keeps some of its present normal (a ridge), one with none all of it.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit, at present.
+        weight: ``[M]`` trust in each surfel.
+        pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
+        cell: lateral extent of a surfel, m.
+
+    Returns:
+        what :func:`sheet_normals` needs.
+    """
+    i, j = pairs
+    helper = torch.where(
+        normal[:, :1].abs() < 0.9, centre.new_tensor([[1.0, 0.0, 0.0]]), centre.new_tensor([[0.0, 1.0, 0.0]])
+    )
+    first = torch.nn.functional.normalize(torch.linalg.cross(normal, helper), dim=1)
+    second = torch.linalg.cross(normal, first)
+    d = centre[j] - centre[i]
+    along = torch.stack([(d * first[i]).sum(1), (d * second[i]).sum(1)], 1)
+    height = (d * normal[i]).sum(1)
+    near = torch.exp(-(d**2).sum(1) / (2 * (NEAR * cell) ** 2) - (height / cell) ** 2 / 2)
+    trust = weight[j] * near
+    square = trust[:, None, None] * along[:, :, None] * along[:, None, :]
+    normal_equations = torch.zeros(len(centre), 2, 2, device=centre.device).index_add(0, i, square)
+    normal_equations = normal_equations + RIDGE * cell**2 * torch.eye(2, device=centre.device)
+    share = torch.linalg.solve(normal_equations[i], trust[:, None] * along)
+    return Sheet(pairs, normal, first, second, share)
+
+
+def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
+    """Normals of surfels whose neighbours are where they are now.
+
+    Args:
+        sheet: from :func:`lay_sheet`.
+        centre: ``[M, 3]`` m, differentiable.
+
+    Returns:
+        ``[M, 3]`` unit.
+
+    Examples:
+        Three surfels in a row that rise by 0.1 a step of 0.1 lean by 45° but for the ridge:
+
+        >>> import torch
+        >>> flat = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.2, 0.0, 1.0]])
+        >>> pairs = torch.tensor([0, 1, 1, 2]), torch.tensor([1, 0, 2, 1])
+        >>> facing = torch.tensor([0.0, 0.0, -1.0]).expand(3, 3)
+        >>> sheet = lay_sheet(flat, facing, torch.ones(3), pairs, 0.1)
+        >>> sheet_normals(sheet, flat)[1].abs()
+        tensor([0., 0., 1.])
+        >>> risen = flat + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
+        >>> [round(x, 2) for x in sheet_normals(sheet, risen)[1].tolist()]
+        [0.64, 0.0, -0.77]
+    """
+    i, j = sheet.pairs
+    height = ((centre[j] - centre[i]) * sheet.normal[i]).sum(1)
+    slope = torch.zeros(len(centre), 2, device=centre.device).index_add(0, i, sheet.share * height[:, None])
+    leaning = sheet.normal - slope[:, :1] * sheet.first - slope[:, 1:] * sheet.second
+    return torch.nn.functional.normalize(leaning, dim=1)
+
+
+def misfits(centre: Tensor, normal: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
+    """How badly each pair fits one surface, in squared radians.
+
+    ``r² = (n̄·d)² + STIFFNESS·|n_i - n_j|²/4``, n̄ the mean of the two normals, d the unit vector between the
+    centres. On any arc of constant curvature n̄·d = 0, so that curved surfaces cost little.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit.
+        pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
+
+    Returns:
+        ``[P]`` r², differentiable.
+    """
+    i, j = pairs
+    d = centre[j] - centre[i]
+    mean, half = (normal[i] + normal[j]) / 2, (normal[i] - normal[j]) / 2
+    out = (mean * d).sum(1) ** 2 / (d**2).sum(1).clamp_min(1e-12)
+    return out + STIFFNESS * (half**2).sum(1)
+
+
+def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
+    """Cost of misfits between neighbours: ``½ Σ w_i w_j ln(1 + r²/BEND²)`` over directed pairs.
+
+    It is the negative logarithm of a Cauchy density: a surface of unknown roughness, so that a smooth sheet
+    is stiff and an edge costs a few nats only (r² from :func:`misfits`).
 
     Args:
         centre: ``[M, 3]`` m.
         normal: ``[M, 3]`` unit.
         weight: ``[M]`` trust in each surfel; a pair counts their product.
         pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
-        crease: c, the angle (rad) at which an edge has half its greatest cost.
-        stiffness: how much a turn of the normals costs beside a step of the places.
 
     Returns:
         A scalar, differentiable in places, normals and weights.
@@ -77,10 +172,30 @@ def bending(
         tensor(0.)
     """
     i, j = pairs
-    d = centre[j] - centre[i]
-    mean, half = (normal[i] + normal[j]) / 2, (normal[i] - normal[j]) / 2
-    r2 = (mean * d).sum(1) ** 2 / (d**2).sum(1).clamp_min(1e-12) + stiffness * (half**2).sum(1)
-    return (weight[i] * weight[j] * r2 / (1 + r2 / crease**2)).sum()
+    return (weight[i] * weight[j] * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
+
+
+def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
+    """Cost of albedos that differ between neighbours: total variation of ln(albedo), in units of STEP.
+
+    The variation is smooth within a unit. Albedos below FAINT of the mean count as equally dark.
+
+    Args:
+        albedo: ``[M]`` ≥ 0.
+        pairs: i and j ``[P]`` from :func:`neighbour_pairs`, both directions.
+
+    Returns:
+        A scalar, differentiable.
+
+    Examples:
+        >>> import torch
+        >>> both = torch.tensor([0, 1]), torch.tensor([1, 0])
+        >>> albedo_steps(torch.tensor([0.4, 0.4]), both)
+        tensor(0.)
+    """
+    i, j = pairs
+    level = torch.log(albedo + FAINT * albedo.detach().mean())
+    return (torch.sqrt(((level[i] - level[j]) / STEP) ** 2 + 1) - 1).sum() / 2
 
 
 def front_sheet(index: Tensor, depth: Tensor, limits: tuple[int, int]) -> Tensor:

@@ -70,7 +70,7 @@ class CriticismSettings:
     finalists: int = 3
     far_off: float = 0.15
     similar: float = 0.9
-    steps: int = 60
+    steps: int = 120
     most: int = 5
     explained: float = 0.67
     numerics: bool = True

@@ -9,7 +9,6 @@ every time, 190 ± 65 where χ² expects 1: no stretched χ² is so narrow.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import multiprocessing
 import time
@@ -86,7 +85,7 @@ def toy_capture(capture: Capture, fit: SurfelFit, seed: int) -> Capture:
     drawn = np.random.default_rng([seed, 77]).poisson(expected)
     counts = np.zeros(capture.counts.shape, dtype=np.uint32)
     counts[:, capture.gate[0] : capture.gate[1]] = drawn
-    return dataclasses.replace(capture, counts=counts)
+    return capture.with_counts(counts)
 
 
 def run_toys(

@@ -16,14 +16,16 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.surfel_graph import Sheet
 from nlos_lit.metrics.transients import transient_scores
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
-from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.model import SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
 WORTH = 0.02  # nats a parameter that another round must gain
+FAINTEST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
 @dataclass(frozen=True)
@@ -36,54 +38,52 @@ class SurfelSettings:
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
         max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None takes 2 where a voxel is wider than six bins, else
-            1.
+        subdivide: surfels along each side of a voxel; None makes them at most three bins of path wide.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
+        contest: batches in which seeds and response stand still, and albedos and effects are fitted.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
             twice as many.
         more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
         batch: spots a step.
-        depth_rate: of Adam, in bins there and back. albedo_rate, normal_rate, response_rate: of the
-            unconstrained values.
+        depth_rate: of Adam, in bins there and back. albedo_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
-        tie: weight of :meth:`SurfelModel.bending`, nats per squared radian and pair.
-        surfel_cost: nats that a surfel must be worth, see :meth:`SurfelModel.presence`.
-        prune: surfels whose albedo is below this many of its standard deviations die.
-        grow: places next to surfels, and unused seeds, whose score exceeds this many standard deviations get
-            one.
+        bending: weight of :meth:`SurfelModel.bending`; 1 takes it for the logarithm of a prior.
+        evenness: weight of :meth:`SurfelModel.albedo_steps`.
+        surfel_cost: nats that a surfel must be worth, see
+            :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
         visibility: surfels hide one another.
     """
 
-    floor: float = 0.05
+    floor: float = 0.1
     significance: float = 5.0
-    per_cell: int = 6
+    per_cell: int = 3
     max_seeds: int = 3000
     subdivide: int | None = None
     quadrature: int | None = None
-    rounds: int = 4
-    steps: int = 100
+    contest: int = 150
+    rounds: int = 5
+    steps: int = 160
     more: int = 4
-    batch: int = 48
+    batch: int = 24
     depth_rate: float = 0.15
     albedo_rate: float = 0.08
-    normal_rate: float = 0.03
     response_rate: float = 0.03
     effect_rate: float = 0.1
-    tie: float = 100.0
-    surfel_cost: float = 0.0
-    prune: float = 1.5
-    grow: float = 3.5
+    bending: float = 0.5
+    evenness: float = 0.5
+    surfel_cost: float = 3.0
     test_spots: int = 384
     visibility: bool = True
 
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
             raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
-        if not 0 < self.floor < 1 or self.tie < 0:
+        least = min(self.contest, self.bending, self.evenness, self.surfel_cost)
+        if not 0 < self.floor < 1 or least < 0:
             raise UserError(
-                "surfels.floor must lie between 0 and 1 and surfels.tie be 0 or more; "
-                f"found {self.floor} and {self.tie}"
+                "surfels.floor must lie between 0 and 1, and surfels.contest, bending, evenness and "
+                f"surfel_cost be 0 or more; found floor={self.floor} and {least}"
             )
 
 
@@ -93,8 +93,10 @@ class Round:
 
     Args:
         steps: batches.
-        left: rounds that follow by plan; the last one cools down, and the tie tightens towards it.
+        left: rounds that follow by plan; the last one cools down.
         settling: it comes from seeds, and the response waits for their places.
+        contest: surfels and response stand still; those that come out faint are left out afterwards.
+        parts: into which each side of a surfel is divided before it.
         grow: surfels die and grow before it.
         shapes: scanned parameters of effects start anew before it, where the counts ask for them.
     """
@@ -104,6 +106,8 @@ class Round:
     settling: bool = False
     grow: bool = False
     shapes: bool = False
+    contest: bool = False
+    parts: int = 1
 
 
 def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) -> list[Round]:
@@ -128,20 +132,23 @@ def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) ->
     ]
 
 
-def plan_from_seeds(settings: SurfelSettings, scan_shapes: bool) -> list[Round]:
+def plan_from_seeds(settings: SurfelSettings, parts: int, scan_shapes: bool) -> list[Round]:
     """The rounds from seeds to the fitted scene, without those that may follow.
 
     Args:
         settings: of the fit.
-        scan_shapes: a first round of its own comes before scanned parameters of effects are started.
+        parts: into which each side of a seed is divided once the seeds have contested.
+        scan_shapes: scanned parameters of effects are started after a first round of places.
 
     Returns:
         the plan.
     """
-    if not scan_shapes:
-        return rounds_of(settings.steps, settings.rounds, settle=True)
-    first, *later = rounds_of(settings.steps, max(1, settings.rounds - 1), settle=False, grow_first=True)
-    return [*rounds_of(settings.steps, 1, settle=True), replace(first, shapes=True), *later]
+    contest = [Round(settings.contest, settings.rounds, settling=True, contest=True)]
+    count = max(settings.rounds, 2) if scan_shapes else settings.rounds
+    first, *later = rounds_of(settings.steps, count, settle=True)
+    if scan_shapes:
+        later[0] = replace(later[0], shapes=True)
+    return [*(contest if settings.contest else ()), replace(first, parts=parts), *later]
 
 
 class SurfelFit:
@@ -163,7 +170,8 @@ class SurfelFit:
         model: where it begins.
         capture: that is fitted.
         grid: surfels stay within its depths.
-        counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``.
+        counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; bins that the capture does not
+            hold as observed take part in nothing.
         settings: of the fit.
         reserve: places that may grow a surfel, besides those next to surfels.
         extension: effects that are fitted along, in place.
@@ -195,6 +203,8 @@ class SurfelFit:
         self.settings, self.reserve, self.extension, self.generator = settings, reserve, extension, generator
         self.order, self.place, self.done = order, 0, 0
         self.tested = order[: settings.test_spots]
+        seen = capture.gated_observed()
+        self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
         self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
         self.history: list[dict[str, float]] = []
@@ -246,6 +256,7 @@ class SurfelFit:
             | {
                 "model": dict(self.model.state_dict()),
                 "pairs": self.model.pairs,
+                "sheet": None if self.model.sheet is None else tuple(self.model.sheet[1:]),
                 "extension": dict(self.extension.state_dict()),
                 "reserve": tuple(self.reserve),
                 "generator": self.generator.get_state(),
@@ -277,8 +288,10 @@ class SurfelFit:
         self.generator.set_state(state["generator"])
         self.plan = [Round(*each) for each in state["plan"]]
         self.optimizer = None
+        if state["sheet"] is not None:
+            self.model.sheet = Sheet(state["pairs"], *state["sheet"])
+        self.model.pairs = state["pairs"]
         self.to(device)
-        self._link(state["pairs"], device)
         if state["optimizer"] is not None:
             self.optimizer = self._new_optimizer()
             for parameter, moments in zip(_parameters(self.optimizer), state["optimizer"], strict=True):
@@ -293,12 +306,13 @@ class SurfelFit:
         self.model.to(device)
         self.extension.to(device)
         self.counts, self.train = self.counts.to(device), self.train.to(device)
+        if self.observed is not None:
+            self.observed = self.observed.to(device)
         self.reserve = Seeds(*(part.to(device) for part in self.reserve))
-        self._link(self.model.pairs, device)
-
-    def _link(self, pairs: tuple[Tensor, Tensor], device: torch.device | str) -> None:
-        first, second = pairs
+        first, second = self.model.pairs
         self.model.pairs = first.to(device), second.to(device)
+        if self.model.sheet is not None:
+            self.model.sheet = Sheet(self.model.pairs, *(part.to(device) for part in self.model.sheet[1:]))
 
     @torch.no_grad()
     def match_energy(self) -> None:
@@ -341,7 +355,7 @@ class SurfelFit:
         parameters = sum(p.numel() for p in [*self.model.parameters(), *self.extension.parameters()])
         gained = (self.before - deviance) * self.counts.numel() / 2
         if deviance > noise and gained >= WORTH * parameters:
-            self.plan = rounds_of(self.settings.steps, 1, settle=False)
+            self.plan = rounds_of(self.settings.steps, 1, settle=False, grow_first=True)
         self.more, self.before = self.more - 1 if self.plan else 0, deviance
 
     @property
@@ -365,38 +379,39 @@ class SurfelFit:
         return sum(each.steps for each in self.plan) - len(self.losses)
 
     def begin_round(self) -> None:
-        """What happens between rounds: shapes, death and growth, who hides whom; a new optimiser."""
+        """What happens between rounds: shapes, death and growth, who hides whom; a new optimiser.
+
+        Normals follow the places of neighbours until the round ends.
+        """
         s, now = self.settings, self.plan[0]
         if now.shapes:
             choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
         if now.grow:
-            prune_and_grow(
-                self.model,
-                self.capture,
-                self.grid,
-                self.reserve,
-                self.counts,
-                self.train,
-                self.tested,
-                s.prune,
-                s.grow,
-                self.extension,
-            )
+            parts = (self.capture, self.grid, self.reserve, self.counts, self.train, self.tested)
+            prune_and_grow(self.model, *parts, s.surfel_cost, self.extension, self.observed)
+        if now.parts > 1:
+            self.model.divide(now.parts)
         if s.visibility:
             self.model.update_visibility()
+        widest = float(self.model.cell.max())
+        self.model.quadrature = (
+            1 if now.contest else s.quadrature or points_along(widest, self.model.bin_length)
+        )
+        self.model.link()
+        self.model.lay()
         self.optimizer = self._new_optimizer()
 
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""
         s, model = self.settings, self.model
-        # The response waits for the places, the tie for the surface: both would otherwise settle around
-        # errors of the seeds.
+        # The response waits for the places: it would otherwise settle around errors of the seeds.
         response_rate = s.response_rate * (0.3 if self.plan[0].settling else 1.0)
+        settled = [] if self.plan[0].contest else [model.raw_depth]
+        response = [] if self.plan[0].contest else list(model.laser_sensor.parameters())
         groups = [
-            {"params": [model.raw_depth], "lr": s.depth_rate},
+            {"params": settled, "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
-            {"params": [model.raw_normal], "lr": s.normal_rate},
-            {"params": list(model.laser_sensor.parameters()), "lr": response_rate},
+            {"params": response, "lr": response_rate},
             {"params": list(self.extension.parameters()), "lr": s.effect_rate},
         ]
         kept = [group | {"highest": group["lr"]} for group in groups if group["params"]]
@@ -427,18 +442,16 @@ class SurfelFit:
             rows: ``[B]`` of the training counts.
 
         Returns:
-            ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``presence``,
+            ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``evenness``,
             ``effects``.
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
-        tie = s.tie * 0.3 ** max(0, self.plan[0].left - 1) * per_count
-        cost = s.surfel_cost * per_count
         expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
-            "bending": tie * model.bending(),
-            "presence": cost * model.presence(),
+            "bending": s.bending * per_count * model.bending(),
+            "evenness": s.evenness * per_count * model.albedo_steps(),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
         return {"loss": sum(terms.values(), torch.zeros(())), **terms}
@@ -466,12 +479,22 @@ class SurfelFit:
 
     def end_round(self) -> None:
         """Note the round, link neighbours anew, and see whether another follows."""
+        self.model.lift()
+        if self.plan[0].contest:
+            self._drop_faint()
         self.model.link()
         sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
         loss = float(np.mean(self.losses[-len(self.losses) // 4 :]))
         self.history.append({"surfels": len(self.model), "loss": loss, **sensor})
         self.plan, self.losses, self.optimizer = self.plan[1:], [], None
         self._add_round()
+
+    @torch.no_grad()
+    def _drop_faint(self) -> None:
+        model = self.model
+        albedo = model.albedo()
+        kept = albedo > FAINTEST * torch.quantile(albedo, 0.99)
+        model.place(model.centre()[kept], model.normal()[kept], albedo[kept])
 
     def finish(self, progress: Progress | None = None) -> list[dict[str, float]]:
         """Do all that is planned, from wherever the fit is.
@@ -529,7 +552,8 @@ class SurfelFit:
     def _deviance(self) -> tuple[float, float]:
         """Per bin of the tested rows, and what noise alone would make."""
         expected = self.model.expected(self.train[self.tested], self.extension)
-        scores = transient_scores(self.counts[self.tested], expected)
+        seen = None if self.observed is None else self.observed[self.tested]
+        scores = transient_scores(self.counts[self.tested], expected, seen)
         return scores.deviance_per_bin, scores.deviance_noise
 
 

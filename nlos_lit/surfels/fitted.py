@@ -129,7 +129,9 @@ def score_spots(model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hook
     """
     first, last = capture.gate
     counts = torch.from_numpy(capture.counts[spots.numpy(), first:last].astype(np.float32))
-    return transient_scores(counts, model.expected(spots, hooks))
+    observed = capture.gated_observed()
+    seen = None if observed is None else torch.from_numpy(observed[spots.numpy()])
+    return transient_scores(counts, model.expected(spots, hooks), seen)
 
 
 @torch.no_grad()

@@ -22,6 +22,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.irf import convolve_time, response
+from nlos_lit.functional.surfel_graph import BEND, misfits
 from nlos_lit.functional.surfel_paths import (
     SPLINE_VARIANCE,
     gather_bins,
@@ -167,6 +168,7 @@ def score(
     expected: Tensor,
     spots: Tensor,
     hooks: Hooks = NOTHING,
+    visible: Tensor | None = None,
 ) -> Score:
     """Test places of surfels against the present expectation.
 
@@ -180,6 +182,7 @@ def score(
         expected: ``[B, T_gate]`` of the spots.
         spots: ``[B]`` rows of the capture that are looked at.
         hooks: effects, whose response is applied.
+        visible: ``[B, V]`` which places the spots see; None: all.
 
     Returns:
         score and information of each place's albedo.
@@ -218,6 +221,8 @@ def score(
         shape = paths.length.shape
         time = ((paths.length - capture.t_start) / capture.bin_length).flatten(1)
         energy = paths.contribution
+        if visible is not None:
+            energy = energy * visible[:, start : start + len(part.centre), None]
         _, weights = spline_weights(time)
         g = (energy * (gather_bins(pull, time) * weights).sum(-1).view(shape)).sum((0, 2))
         # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information
@@ -230,8 +235,8 @@ def score(
     return Score(total[0] * gain, total[1] * gain**2)
 
 
-def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Seeds:
-    """The eight places around each surfel to which its plane extends.
+def continuations(centre: Tensor, normal: Tensor, cell: Tensor) -> tuple[Seeds, Tensor]:
+    """The eight places around each surfel to which its sheet may extend: straight on, or bent either way.
 
     Args:
         centre: ``[M, 3]`` m.
@@ -239,13 +244,19 @@ def neighbour_candidates(centre: Tensor, normal: Tensor, cell: Tensor) -> Seeds:
         cell: ``[2]`` extents of a cell, m.
 
     Returns:
-        8 M places with the normals of their surfels.
+        24 M places with their normals, and ``[24 M]`` long the surfel that each continues.
     """
-    moves = torch.tensor(
-        [(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if i or j], device=centre.device
-    )
-    shift, _ = spread(normal, cell, moves)
-    return Seeds((centre[:, None] + shift).reshape(-1, 3), normal[:, None].expand(-1, 8, 3).reshape(-1, 3))
+    steps = [(i, j) for i in (-1.0, 0.0, 1.0) for j in (-1.0, 0.0, 1.0) if i or j]
+    shift, _ = spread(normal, cell, torch.tensor(steps, device=centre.device))
+    length = shift.norm(dim=2, keepdim=True)
+    onward = shift / length
+    source = torch.arange(len(centre), device=centre.device)[:, None].expand(-1, len(steps))
+    centres, normals = [], []
+    for turn in (0.0, BENT, -BENT):
+        way = math.cos(turn / 2) * onward - math.sin(turn / 2) * normal[:, None]
+        centres.append((centre[:, None] + length * way).reshape(-1, 3))
+        normals.append((math.cos(turn) * normal[:, None] + math.sin(turn) * onward).reshape(-1, 3))
+    return Seeds(torch.cat(centres), torch.cat(normals)), source.reshape(-1).repeat(3)
 
 
 def facings(places: Seeds) -> Seeds:
@@ -313,8 +324,73 @@ TILTS = (
     (0.0, 1.0),
     (0.0, -1.0),
 )  # tangents of the facings tried, in units of √3
+BENT = 0.25  # rad by which a sheet may turn from one cell to the next
 APART = 0.7  # surfels keep this many cells from each other
-FIRST_SHARE = 0.3  # of the one-step albedo: neighbours that grow together share the same residual
+FIRST_SHARE = 0.5  # of the best albedo: neighbours that grow together share the same residual
+ALIKE = 0.7  # deviation of ln(albedo) that a continued sheet is given
+ALBEDOS = (0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0)  # of its neighbour's, that are tried
+MOST_SUPPORT = 4.0  # nats that neighbours give at most
+LONE = 12.0  # nats, 5 standard deviations, that a surfel without a sheet must gain
+
+
+@torch.no_grad()
+def support(model: SurfelModel) -> Tensor:
+    """Nats that neighbours speak for each surfel: one each in its own plane, none at a right angle.
+
+    Args:
+        model: the surfels, linked.
+
+    Returns:
+        ``[M]``, at most ``MOST_SUPPORT``.
+    """
+    i, j = model.pairs
+    misfit = misfits(model.centre(), model.normal(), model.pairs)
+    agree = 1 - torch.log1p(misfit / BEND**2) / math.log1p(1 / BEND**2)
+    given = model.trust()[j] * agree
+    return torch.zeros(len(model), device=given.device).index_add(0, i, given).clamp_max(MOST_SUPPORT)
+
+
+def dispersion(significance: Tensor) -> float:
+    """Variance of the scores of places that ask for *less* light, at least the 1 of noise alone.
+
+    A place without a surfel cannot have too much light: scores below 0 are noise, or a misfit that is not the
+    surface's, such as an effect that the model lacks. That makes light seem to be missing as often, and a
+    place must stand out from it.
+
+    Args:
+        significance: ``[V]`` of places, standard deviations.
+
+    Returns:
+        1 where there are none; from the median of their sizes.
+
+    Examples:
+        >>> dispersion(torch.tensor([-6.745, 0.0, 50.0, 60.0]))
+        100.0
+    """
+    below = -significance[significance < 0]
+    if not len(below):
+        return 1.0
+    return max(1.0, round(float(below.median()) / 0.6745, 6) ** 2)
+
+
+@torch.no_grad()
+def continuing_gain(result: Score, albedo: Tensor, dispersion: float) -> tuple[Tensor, Tensor]:
+    """What a surfel that continues a sheet gains, its albedo a priori log-normal about its neighbour's.
+
+    Args:
+        result: of V places.
+        albedo: ``[V]`` of the surfels that they continue.
+        dispersion: of the scores over what noise alone makes; the counts speak by so much less.
+
+    Returns:
+        ``[V]`` largest log-posterior over ``ALBEDOS``, nats, and the albedo there.
+    """
+    tried = albedo.double()[:, None] * torch.tensor(ALBEDOS, dtype=torch.float64, device=albedo.device)
+    away = torch.tensor([math.log(x) / ALIKE for x in ALBEDOS], device=albedo.device)
+    counts = result.score[:, None] * tried - result.information[:, None] * tried**2 / 2
+    gain = counts / dispersion - away**2 / 2
+    best, which = gain.max(1)
+    return best, tried.gather(1, which[:, None])[:, 0]
 
 
 @torch.no_grad()
@@ -326,68 +402,81 @@ def prune_and_grow(
     counts: Tensor,
     train: Tensor,
     tested: Tensor,
-    prune: float,
-    grow: float,
+    cost: float,
     hooks: Hooks = NOTHING,
+    observed: Tensor | None = None,
 ) -> None:
-    """Drop surfels that the counts do not need or that left the volume; add some where light is missing.
+    """Drop surfels that neither counts nor neighbours speak for; extend sheets; begin new ones.
+
+    A surfel stays while what the counts lose without it (``a² F/2``) and the :func:`support` of its
+    neighbours exceed ``cost``. A place that continues a sheet gets one where it gains more than
+    that. A place of the reserve, away from all sheets, must gain ``LONE`` nats, counted against the
+    spread of all places' scores: a misfit that is not the surface's makes light seem to be missing
+    everywhere.
 
     Args:
-        model: whose surfels are replaced.
+        model: whose surfels are replaced; linked, its normals its own.
         capture: that is fitted.
         grid: whose depths bound the volume.
-        reserve: unused seeds; candidates besides the places next to surfels.
+        reserve: unused seeds.
         counts: ``[N, T_gate]`` of the training spots.
         train: ``[N]`` their rows of the capture.
         tested: rows of ``counts`` that are looked at.
-        prune: significance below which a surfel dies, over all training spots.
-        grow: significance from which on a place gets one, over all training spots.
+        cost: nats that a lone surfel must be worth.
         hooks: effects of the present expectation; candidates are tested with their response.
+        observed: ``[N, T_gate]`` bool, the bins that were recorded; None: all.
 
     Raises:
         UserError: no surfel is left.
     """
     spots, seen = train[tested], counts[tested]
-    expected = model.expected(spots, hooks)
+    expected = model.expected(spots, hooks).clamp_min(1e-9)
+    if observed is not None:  # what was not recorded asks for nothing
+        seen = torch.where(observed[tested], seen, expected)
     scale = len(train) / len(tested)
     low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
-    sensor, (across, along) = model.laser_sensor, model.cell.tolist()
+    sensor, cell = model.laser_sensor, (float(model.cell[0]), float(model.cell[1]))
 
-    def test(places: Seeds, points: int) -> Score:
-        return score(places, capture, (across, along), points, sensor, seen, expected, spots, hooks)
+    def test(places: Seeds, points: int, visible: Tensor | None = None) -> Score:
+        found = score(places, capture, cell, points, sensor, seen, expected, spots, hooks, visible)
+        return Score(found.score * scale, found.information * scale)
 
-    present = Seeds(model.centre(), model.normal())
-    albedo = model.albedo()
-    needed = albedo * (test(present, model.quadrature).information * scale).sqrt() > prune
-    needed &= (present.centre[:, 2] > low) & (present.centre[:, 2] < high)
-    if not needed.any():
+    def inside(places: Tensor) -> Tensor:
+        return (places[:, 2] > low) & (places[:, 2] < high)
+
+    present, albedo = Seeds(model.centre(), model.normal()), model.albedo()
+    information = test(present, model.quadrature, model.visible[spots] if len(model.visible) else None)[1]
+    worth = albedo.double() ** 2 * information / 2 + support(model)
+    kept = (worth > cost) & inside(present.centre)
+    if not kept.any():
         raise UserError(
-            "every surfel faded away during refinement: the counts hold no third-bounce light at the image's "
+            "every surfel faded away during the fit: the counts hold no third-bounce light at the image's "
             "maxima"
         )
-    kept, albedo = present.take(needed), albedo[needed]
-    places = Seeds(
-        *(torch.cat(p) for p in zip(neighbour_candidates(*kept, model.cell), reserve, strict=True))
-    )
     apart = APART * float(model.cell.max())
-    free = (
-        ~occupied(places.centre, kept.centre, apart)
-        & (places.centre[:, 2] > low)
-        & (places.centre[:, 2] < high)
-    )
-    places = facings(places.take(free))
+    places, source = continuations(*present, model.cell)
+    free = ~occupied(places.centre, present.centre, apart) & inside(places.centre)
+    free &= places.normal[:, 2] < 0.2
+    places, source = places.take(free), source[free]
     result = test(places, 1)
-    wanted = result.significance * math.sqrt(scale) > grow
-    places, result = places.take(wanted), Score(*(v[wanted] for v in result))
+    gain, light = continuing_gain(result, albedo[source], dispersion(result.significance))
+    wanted = gain > cost
+    places, gain, light = places.take(wanted), gain[wanted], light[wanted]
+
+    others = facings(reserve.take(~occupied(reserve.centre, present.centre, apart) & inside(reserve.centre)))
+    result = test(others, 1)
+    lone = result.significance.clamp_min(0) ** 2 / 2 / dispersion(result.significance)
+    begun = lone > LONE
+    others = others.take(begun)
+    first = (result.score / result.information.clamp_min(1e-30))[begun].clamp_max(float(albedo.mean()))
+    places = Seeds(*(torch.cat(pair) for pair in zip(places, others, strict=True)))
+    gain, light = torch.cat([gain, lone[begun]]), torch.cat([light, first])
     # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to
     # explain it otherwise.
-    chosen = best_apart(places.centre, result.significance, apart)[: max(20, len(albedo) // 5)]
-    start = (
-        (FIRST_SHARE * result.score / result.information)[chosen]
-        .float()
-        .clamp(1e-3 * albedo.mean(), albedo.mean())
-    )
-    new = places.take(chosen)
+    chosen = best_apart(places.centre, gain, apart)[: max(64, len(albedo) // 4)]
+    new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
     model.place(
-        torch.cat([kept.centre, new.centre]), torch.cat([kept.normal, new.normal]), torch.cat([albedo, start])
+        torch.cat([present.centre[kept], new.centre]),
+        torch.cat([present.normal[kept], new.normal]),
+        torch.cat([albedo[kept], begin]),
     )

@@ -5,14 +5,32 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nlos_lit.capture import Capture
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.irf import convolve_time
-from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
-from nlos_lit.functional.surfel_paths import SPLINE_VARIANCE, STEEP, Paths, SplineSplat, quadrature, trace
+from nlos_lit.functional.surfel_graph import (
+    Sheet,
+    albedo_steps,
+    bending,
+    clear_view,
+    front_sheet,
+    lay_sheet,
+    neighbour_pairs,
+    sheet_normals,
+)
+from nlos_lit.functional.surfel_paths import (
+    SPLINE_VARIANCE,
+    STEEP,
+    Paths,
+    SplineSplat,
+    quadrature,
+    spread,
+    trace,
+)
 from nlos_lit.io.points import Points
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
@@ -46,7 +64,9 @@ class SurfelModel(nn.Module):
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
         visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
+        observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
         pairs: neighbours on one sheet, see :meth:`link`.
+        sheet: how normals follow from places, between :meth:`lay` and :meth:`lift`; None otherwise.
     """
 
     laser: Tensor
@@ -57,7 +77,9 @@ class SurfelModel(nn.Module):
     anchor: Tensor
     direction: Tensor
     visible: Tensor
+    observed: Tensor
     pairs: tuple[Tensor, Tensor]
+    sheet: Sheet | None
 
     def __init__(
         self,
@@ -78,6 +100,12 @@ class SurfelModel(nn.Module):
             self.register_buffer(
                 name, torch.tensor(getattr(capture, name), dtype=torch.float32), persistent=False
             )
+        seen = (
+            np.ones((0, self.n_bins), bool)
+            if capture.observed is None
+            else capture.observed[:, : self.n_bins]
+        )
+        self.register_buffer("observed", torch.from_numpy(seen), persistent=False)
         cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
         self.register_buffer("cell", cell, persistent=False)
         self.place(centre, normal, albedo)
@@ -104,7 +132,20 @@ class SurfelModel(nn.Module):
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
         )
+        self.sheet = None
         self.link()
+
+    @torch.no_grad()
+    def divide(self, parts: int) -> None:
+        """Replace each surfel by ``parts`` × ``parts`` smaller ones on its own plane."""
+        normal, pitch = self.normal(), self.lateral.pitch
+        shift, _ = spread(normal, self.cell, quadrature(parts, self.cell.device))
+        centre = (self.centre()[:, None] + shift).reshape(-1, 3)
+        finer = (pitch[0] / parts, pitch[1] / parts)
+        x, y = (o - (parts - 1) / 2 * p for o, p in zip(self.lateral.origin, finer, strict=True))
+        nx, ny = self.lateral.shape
+        self.lateral, self.cell = Lateral((x, y), finer, (nx * parts, ny * parts)), self.cell / parts
+        self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in (normal, self.albedo())))
 
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
@@ -112,6 +153,8 @@ class SurfelModel(nn.Module):
 
     def normal(self) -> Tensor:
         """``[M, 3]`` unit, towards the wall's side."""
+        if self.sheet is not None:
+            return sheet_normals(self.sheet, self.centre())
         return torch.nn.functional.normalize(self.raw_normal, dim=1)
 
     def albedo(self) -> Tensor:
@@ -128,23 +171,35 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def link(self) -> None:
-        """Find each surfel's neighbours on its sheet, for :meth:`bending`."""
+        """Find each surfel's neighbours on its sheet."""
         normal = self.normal()
         stretch = (1 / (-normal[:, 2]).clamp_min(STEEP)).clamp_max(2.0)
         self.pairs = neighbour_pairs(self.centre(), normal, 1.6 * self.cell.max() * stretch)
 
-    def bending(self) -> Tensor:
-        """How badly neighbours fit one surface, in squared radians summed over pairs."""
+    @torch.no_grad()
+    def lay(self) -> None:
+        """From now on normals follow from the places of neighbours, until :meth:`lift`."""
+        self.lift()
+        self.sheet = lay_sheet(self.centre(), self.normal(), self.trust(), self.pairs, float(self.cell.max()))
+
+    @torch.no_grad()
+    def lift(self) -> None:
+        """Normals stay as they are, and stand for themselves from now on."""
+        self.raw_normal.copy_(self.normal())
+        self.sheet = None
+
+    def trust(self) -> Tensor:
+        """``[M]`` weight of each surfel among its neighbours, from 0 for dark ones to 1."""
         albedo = self.albedo().detach()
-        return bending(self.centre(), self.normal(), albedo / (albedo + 0.3 * albedo.mean()), self.pairs)
+        return albedo / (albedo + 0.3 * albedo.mean())
 
-    def presence(self) -> Tensor:
-        """How many surfels there are, each counted as a/(a + ε).
+    def bending(self) -> Tensor:
+        """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`."""
+        return bending(self.centre(), self.normal(), self.trust(), self.pairs)
 
-        ε is a tenth of the mean albedo a: the weak ones feel it most.
-        """
-        albedo = self.albedo()
-        return (albedo / (albedo + 0.1 * albedo.detach().mean())).sum()
+    def albedo_steps(self) -> Tensor:
+        """How much albedos of neighbours differ, see the function of the same name."""
+        return albedo_steps(self.albedo(), self.pairs)
 
     @torch.no_grad()
     def update_visibility(self, opaque: float = 0.3, skip: float = 1.5, samples: int = 32) -> None:
@@ -219,7 +274,7 @@ class SurfelModel(nn.Module):
         )
 
     def detect(self, signal: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
-        """Stage 5: gain, background and counting.
+        """Stage 5: gain, background and counting; nothing in bins that were not recorded.
 
         Args:
             signal: ``[B, T]`` counts of the light.
@@ -230,7 +285,8 @@ class SurfelModel(nn.Module):
             ``[B, T]`` expected counts.
         """
         background = hooks.background(self.laser_sensor.background(), spots)
-        return hooks.counting(hooks.gain(signal, spots) + background, spots)
+        counted = hooks.counting(hooks.gain(signal, spots) + background, spots)
+        return counted * self.observed[spots] if len(self.observed) else counted
 
     def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
         """Stages 4 and 5.
@@ -364,3 +420,20 @@ def spline_sensor(capture: Capture, parameters: dict[str, BoundedParameter]) -> 
 def inverse_softplus(value: Tensor) -> Tensor:
     """x with softplus(x) = value > 0."""
     return value + torch.log(-torch.expm1(-value))
+
+
+def points_along(cell: float, bin_length: float) -> int:
+    """Quadrature points along each side of a surfel: their arrivals are about two bins apart; at most 8.
+
+    Args:
+        cell: side of the surfel, m.
+        bin_length: optical path of one bin, m.
+
+    Returns:
+        at least 1.
+
+    Examples:
+        >>> points_along(0.03, 0.0096), points_along(0.01, 0.0096)
+        (2, 1)
+    """
+    return min(8, max(1, math.ceil(cell * 0.55 / bin_length)))

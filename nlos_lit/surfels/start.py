@@ -16,9 +16,10 @@ from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.runtime.memory import check_machine
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings, plan_from_seeds
 from nlos_lit.surfels.growth import rank_one, score, start_response, volume_maxima
-from nlos_lit.surfels.model import Lateral, SurfelModel
+from nlos_lit.surfels.model import Lateral, SurfelModel, points_along
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
+WIDEST = 3.0  # bins of path that a surfel's side spans at most; docs/surface.md says what wider ones cost
 RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
 
 
@@ -68,12 +69,7 @@ def seed_surfels(
         raise UserError(
             "the training spots hold no counts inside the gate; check the gate and the held-out spots"
         )
-    widest, bins = max(abs(p) for p in grid.pitch[:2]), capture.bin_length
-    subdivide = s.subdivide or (2 if widest > 6 * bins else 1)
-    points = s.quadrature or int(np.clip(math.ceil(widest / subdivide * 0.55 / bins), 1, 8))
-    dx, dy = (p / subdivide for p in grid.pitch[:2])
-    x, y = (o - (subdivide - 1) / 2 * p for o, p in zip(grid.origin[:2], (dx, dy), strict=True))
-    lateral = Lateral((x, y), (dx, dy), (grid.shape[1] * subdivide, grid.shape[2] * subdivide))
+    lateral = Lateral(tuple(grid.origin[:2]), tuple(grid.pitch[:2]), tuple(grid.shape[1:]))
     sensor = start_response(capture, counts, laser_sensor_start)
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(train), generator=generator)
@@ -93,9 +89,6 @@ def seed_surfels(
         )
     best = significance.topk(min(s.max_seeds, len(significance))).indices
     seeds = candidates.take(keep)
-    step_bytes = int(keep.sum()) * points**2 * min(s.batch, len(train)) * BYTES_PER_PATH
-    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
-    check_machine(step_bytes + 8 * counts.numel(), "one step of the surface fit", smaller)
     model = SurfelModel(
         capture,
         centre=seeds.centre,
@@ -103,12 +96,16 @@ def seed_surfels(
         albedo=value[keep] / value[keep].mean(),
         lateral=lateral,
         laser_sensor=sensor,
-        quadrature=points,
     )
+    parts = s.subdivide or math.ceil(float(model.cell.max()) / (WIDEST * capture.bin_length))
+    points = s.quadrature or points_along(float(model.cell.max()) / parts, capture.bin_length)
+    step_bytes = len(model) * (parts * points) ** 2 * min(s.batch, len(train)) * BYTES_PER_PATH
+    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
+    check_machine(step_bytes + 8 * counts.numel(), "one step of the surface fit", smaller)
     fit = SurfelFit(
         model, capture, grid, counts, train, s, candidates.take(best), extension, generator, order
     )
     fit.match_energy()
     scan_shapes = scan_shapes and any(effect.shapes for effect in extension.effects)
-    fit.schedule(plan_from_seeds(s, scan_shapes), s.more)
+    fit.schedule(plan_from_seeds(s, parts, scan_shapes), s.more)
     return fit

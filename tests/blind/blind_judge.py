@@ -26,7 +26,7 @@ from nlos_lit.inference.split import split_spots
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
 
-SURFELS = SurfelSettings(surfel_cost=10.0, prune=3.0)  # conf/surfels/criticism.yaml
+SURFELS = SurfelSettings()
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, plan_from_see
 from nlos_lit.surfels.growth import Seeds
 
 pytestmark = FORWARD_MODE
-SETTINGS = SurfelSettings(rounds=2, steps=4, more=2, batch=24, test_spots=50, quadrature=1)
+SETTINGS = SurfelSettings(contest=3, rounds=2, steps=4, more=2, batch=24, test_spots=50, quadrature=1)
 
 
 def begun() -> SurfelFit:
@@ -32,7 +32,7 @@ def begun() -> SurfelFit:
     fit.settings, fit.tested = SETTINGS, fit.order[:50]
     fit.grid = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
     fit.reserve = Seeds(torch.tensor([[0.0, 0.0, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
-    fit.schedule(plan_from_seeds(SETTINGS, scan_shapes=True), SETTINGS.more)
+    fit.schedule(plan_from_seeds(SETTINGS, 2, scan_shapes=True), SETTINGS.more)
     return fit
 
 
@@ -58,7 +58,7 @@ def same(first: object, second: object) -> bool:
 def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_path):
     straight, stopped, moments = begun(), begun(), 0
     straight.finish()
-    assert straight.history[0]["surfels"] == 12
+    assert straight.history[0]["surfels"] <= 12
     assert len(straight.history) > 2  # rounds were added
     while not stopped.finished:
         stopped = through_a_file(stopped, tmp_path / "state.pt")
@@ -102,21 +102,49 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
         if fit.round_done:
             fit.end_round()
     first, last = np.array(rates[:4]), np.array(rates[4:])
-    highest = [0.15, 0.08, 0.03, 0.03, 0.1]
-    slow = [1, 1, 1, 0.3, 1]  # the response waits
+    highest = [0.15, 0.08, 0.03, 0.1]
+    slow = [1, 1, 0.3, 1]  # the response waits
     assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, np.multiply(highest, slow)))
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 
 
 def test_a_plan_is_the_rounds_in_order():
-    settings = dataclasses.replace(SETTINGS, rounds=3, steps=10)
-    assert plan_from_seeds(settings, scan_shapes=False) == [
-        Round(10, left=2, settling=True),
+    settings = dataclasses.replace(SETTINGS, rounds=3, steps=10, contest=7)
+    contest = Round(7, left=3, settling=True, contest=True)
+    assert plan_from_seeds(settings, 2, scan_shapes=False) == [
+        contest,
+        Round(10, left=2, settling=True, parts=2),
         Round(10, left=1, grow=True),
         Round(20, grow=True),
     ]
-    assert plan_from_seeds(settings, scan_shapes=True) == [
-        Round(20, settling=True),
+    assert plan_from_seeds(settings, 1, scan_shapes=True) == [
+        contest,
+        Round(10, left=2, settling=True),
         Round(10, left=1, grow=True, shapes=True),
         Round(20, grow=True),
     ]
+    without = dataclasses.replace(settings, contest=0)
+    assert plan_from_seeds(without, 2, scan_shapes=False)[0] == Round(10, left=2, settling=True, parts=2)
+
+
+def test_seeds_stand_still_while_they_contest_and_faint_ones_go():
+    fit = begun()
+    fit.settings = dataclasses.replace(SETTINGS, albedo_rate=1e-6)
+    depths = fit.model.raw_depth.detach().clone()
+    with torch.no_grad():
+        fit.model.raw_albedo[3] = -12.0  # softplus: 6e-6
+        albedo = fit.model.albedo()
+        left = int((albedo > 0.01 * torch.quantile(albedo, 0.99)).sum())
+    assert left < len(depths)
+    fit.begin_round()
+    assert fit.plan[0].contest
+    assert fit.model.quadrature == 1
+    for _ in range(3):
+        fit.step()
+    assert torch.equal(fit.model.raw_depth, depths)
+    fit.end_round()
+    assert len(fit.model) == left
+    fit.begin_round()
+    assert len(fit.model) == 4 * left
+    fit.step()
+    assert fit.model.raw_depth.abs().max() > 0

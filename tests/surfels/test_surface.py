@@ -23,12 +23,20 @@ from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels, score_spots
-from nlos_lit.surfels.growth import Seeds, best_apart, neighbour_candidates, occupied, prune_and_grow
+from nlos_lit.surfels.growth import (
+    Score,
+    Seeds,
+    best_apart,
+    continuations,
+    continuing_gain,
+    dispersion,
+    occupied,
+    prune_and_grow,
+    support,
+)
 from nlos_lit.surfels.model import SurfelModel
 
-QUICK = SurfelSettings(
-    rounds=3, steps=60, more=0, batch=24, test_spots=200, floor=0.15, per_cell=2, quadrature=2
-)
+QUICK = SurfelSettings(contest=40, rounds=3, steps=100, more=0, test_spots=200, floor=0.15, per_cell=2)
 BIN = 0.0096
 
 
@@ -127,7 +135,7 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
 
 def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
     capture, held, intensity, grid, _ = fitted
-    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=1, steps=20)
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, contest=0, rounds=1, steps=20)
     seen, deviances, rounds = [], [], []
     for more in (0, 1, 6):
         settings = dataclasses.replace(short, more=more)
@@ -184,7 +192,7 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
         assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
     assert ripple["amplitude"] == pytest.approx(0.2, abs=0.03)
     assert scores[True] < scores[False] - 0.02
-    assert seen[180:] == [(k, 240) for k in range(1, 241)]
+    assert seen[340:] == [(k, 340) for k in range(1, 341)]
 
 
 def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
@@ -209,7 +217,7 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
 def test_progress_counts_every_step(fitted):
     capture, held, intensity, grid, _ = fitted
     seen = []
-    settings = dataclasses.replace(QUICK, rounds=2, steps=3)
+    settings = dataclasses.replace(QUICK, contest=3, rounds=2, steps=3)
     fit_surfels(
         capture,
         intensity,
@@ -218,7 +226,7 @@ def test_progress_counts_every_step(fitted):
         np.flatnonzero(~held),
         progress=lambda done, total: seen.append((done, total)),
     )
-    assert seen == [(k, 9) for k in range(1, 10)]
+    assert seen == [(k, 12) for k in range(1, 13)]
 
 
 @pytest.mark.parametrize("ambient", [0.3, 40.0])
@@ -259,7 +267,7 @@ def test_surfels_in_empty_space_die_and_missing_ones_grow(fitted):
     train = torch.from_numpy(np.flatnonzero(~held))
     counts = torch.from_numpy(capture.gated_counts())[train]
     nothing = Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
-    prune_and_grow(model, capture, grid, nothing, counts, train, torch.arange(200), prune=1.5, grow=3.5)
+    prune_and_grow(model, capture, grid, nothing, counts, train, torch.arange(200), cost=3.0)
     now = model.centre().detach()
     assert torch.cdist(ghosts, now).min() > 0.02
     assert ((now[:, :2] - torch.tensor([0.12, 0.08])).norm(dim=1) < 0.06).sum() >= 2
@@ -270,11 +278,127 @@ def test_candidates_keep_apart():
     assert best_apart(centre, torch.tensor([1.0, 3.0, 2.0]), 0.05).tolist() == [1, 2]
     assert len(best_apart(centre[:0], torch.zeros(0), 0.05)) == 0
     assert occupied(centre, centre[:1], 0.05).tolist() == [True, True, False]
-    around = neighbour_candidates(
+    around, source = continuations(
         torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.6, 0.0, -0.8]]), torch.tensor([0.1, 0.2])
     )
     # Slope 0.75 along x: a step of 0.1 in x rises by 0.075.
-    assert torch.allclose(around.centre[-1], torch.tensor([0.1, 0.2, 1.075]), atol=1e-6)
+    assert torch.allclose(around.centre[7], torch.tensor([0.1, 0.2, 1.075]), atol=1e-6)
+    assert torch.allclose(around.normal[7], torch.tensor([0.6, 0.0, -0.8]))
+    assert source.tolist() == [0] * 24
+
+
+def test_a_bent_continuation_lies_on_the_circle_through_both_places():
+    """Chord and tangents: the line between the centres makes half the turn with either plane."""
+    centre, normal = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+    places, _ = continuations(centre, normal, torch.tensor([0.1, 0.1]))
+    step = places.centre - centre
+    for turn, part in ((0.25, slice(8, 16)), (-0.25, slice(16, 24))):
+        rise = torch.asin(step[part, 2] / step[part].norm(dim=1))
+        assert torch.allclose(rise, torch.full((8,), turn / 2), atol=1e-6)
+        assert torch.allclose(-places.normal[part, 2], torch.full((8,), float(np.cos(turn))), atol=1e-6)
+
+
+def test_gains_of_a_continued_sheet_by_hand():
+    """Score 40, information 100: the best albedo is 0.4, and gains 40·0.4 - 50·0.16 = 8 nats."""
+    result = Score(torch.tensor([40.0]), torch.tensor([100.0]))
+    gain, albedo = continuing_gain(result, torch.tensor([0.4]), 1.0)
+    assert (gain.item(), albedo.item()) == (pytest.approx(8.0), pytest.approx(0.4))
+    # A neighbour twice as bright: 0.4 is half of it, which the prior (deviation 0.7) holds against it.
+    gain, albedo = continuing_gain(result, torch.tensor([0.8]), 1.0)
+    assert (gain.item(), albedo.item()) == (
+        pytest.approx(8 - (np.log(2) / 0.7) ** 2 / 2, abs=1e-5),
+        pytest.approx(0.4),
+    )
+    assert continuing_gain(result, torch.tensor([0.4]), 4.0)[0].item() == pytest.approx(2.0)
+
+
+def test_dispersion_looks_at_places_with_too_much_light_alone():
+    noise = torch.randn(20_000, generator=torch.Generator().manual_seed(0))
+    assert dispersion(noise) == pytest.approx(1.0, abs=0.05)
+    assert dispersion(torch.cat([noise, torch.full((30_000,), 80.0)])) == pytest.approx(1.0, abs=0.05)
+    assert dispersion(7 * noise) == pytest.approx(49, rel=0.05)
+    assert dispersion(torch.zeros(0)) == 1.0
+
+
+def flat_sheet(capture: Capture, result, tilt: float = 0.0) -> SurfelModel:
+    """3 × 3 surfels of one plane, the middle one turned by ``tilt`` about y."""
+    model = SurfelModel.from_state(capture, result.model.state_dict())
+    x, y = torch.meshgrid(*(torch.arange(-1.0, 2.0) * float(model.cell[0]),) * 2, indexing="ij")
+    centre = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((9,), 0.6)], 1)
+    normal = torch.tensor([[0.0, 0.0, -1.0]]).repeat(9, 1)
+    normal[4] = torch.tensor([np.sin(tilt), 0.0, -np.cos(tilt)])
+    model.place(centre, normal, torch.ones(9))
+    return model
+
+
+def test_neighbours_support_what_lies_in_their_plane(fitted):
+    capture, result = fitted[0], fitted[-1]
+    flat = support(flat_sheet(capture, result))
+    trust = 1 / 1.3
+    assert torch.allclose(flat[[0, 2, 6, 8]], torch.tensor(3 * trust))  # a corner has three neighbours
+    assert torch.allclose(flat[[1, 3, 5, 7]], torch.tensor(5 * trust))
+    assert flat[4] == 4.0  # eight, of which at most 4 nats count
+    leaning = support(flat_sheet(capture, result, tilt=1.0))
+    assert leaning[4] < 0.6 * flat[4]
+
+
+def test_normals_follow_places_while_a_sheet_is_laid(fitted):
+    capture, result = fitted[0], fitted[-1]
+    model = flat_sheet(capture, result)
+    model.lay()
+    assert torch.allclose(model.normal(), torch.tensor([0.0, 0.0, -1.0]).expand(9, 3), atol=1e-6)
+    with torch.no_grad():  # z rises by a fifth of x
+        model.raw_depth.copy_(0.2 * model.anchor[:, 0] / (model.bin_length / 2))
+    lean = -(model.normal()[4, 0] / model.normal()[4, 2]).item()
+    assert 0.16 < lean < 0.2  # the ridge keeps some of what was
+    gradient = torch.autograd.grad(model.normal()[4, 0], model.raw_depth)[0]
+    assert gradient[1] != 0
+    assert gradient[4].abs() < 1e-6
+    kept = model.normal().detach()
+    model.lift()
+    assert torch.allclose(model.normal(), kept)
+    with torch.no_grad():
+        model.raw_depth.zero_()
+    assert torch.allclose(model.normal(), kept)
+
+
+def test_division_keeps_plane_area_and_albedo(fitted):
+    capture, result = fitted[0], fitted[-1]
+    model = SurfelModel.from_state(capture, result.model.state_dict())
+    before, spots = model.expected(torch.arange(20)), torch.arange(20)
+    number, quadrature = len(model), model.quadrature
+    visible = model.visible
+    model.quadrature = 2 * quadrature
+    fine = model.expected(spots)
+    model.divide(2)
+    model.quadrature, model.visible = quadrature, visible.repeat_interleave(4, 1)
+    assert len(model) == 4 * number
+    flat = -result.model.normal()[:, 2] > 0.9
+    assert flat.all() or flat.float().mean() > 0.5
+    assert (model.expected(spots) - fine).norm() < 2e-3 * before.norm()
+
+
+def test_bins_that_were_not_recorded_take_part_in_nothing(fitted):
+    """Nothing is expected there, so that no likelihood and no gradient knows of them."""
+    capture, held, intensity, grid, _ = fitted
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=2, steps=10)
+    observed = np.ones(capture.counts.shape, bool)
+    observed[::3, :60] = False
+    cut = dataclasses.replace(capture, observed=observed, counts=capture.counts * observed)
+    result = fit_surfels(cut, intensity, grid, short, train, heldout_spots=np.flatnonzero(held))
+    blind = dataclasses.replace(cut, observed=None)
+    wrong = fit_surfels(blind, intensity, grid, short, train, heldout_spots=np.flatnonzero(held))
+    assert result.heldout.deviance_per_bin < wrong.heldout.deviance_per_bin
+    expected = result.expected(torch.arange(capture.n_spots)).numpy()
+    assert (expected[~observed] == 0).all()
+    assert (expected[observed] > 0).all()
+    terms = result.fit.loss(torch.arange(30))["counts"]
+    rows = result.fit.train[:30].numpy()
+    kept = observed[rows]
+    counts = cut.counts[rows][kept]
+    by_hand = (expected[rows][kept] - counts * np.log(expected[rows][kept])).sum() / kept.size
+    assert terms.item() == pytest.approx(by_hand, rel=1e-3)
+    assert wrong.expected(torch.arange(3))[0, :60].min() > 0
 
 
 def test_impossible_input_is_refused(fitted):
@@ -285,3 +409,5 @@ def test_impossible_input_is_refused(fitted):
         SurfelSettings(rounds=0)
     with pytest.raises(UserError, match="floor"):
         SurfelSettings(floor=1.5)
+    with pytest.raises(UserError, match="evenness"):
+        SurfelSettings(evenness=-1.0)

@@ -12,7 +12,16 @@ from data_modules.simulate import ScanPlan, simulate_transients
 from data_modules.simulate.scenes import plate
 from nlos_lit.capture import Capture
 from nlos_lit.effects.hooks import NOTHING, Hooks
-from nlos_lit.functional.surfel_graph import bending, clear_view, front_sheet, neighbour_pairs
+from nlos_lit.functional.surfel_graph import (
+    BEND,
+    STIFFNESS,
+    albedo_steps,
+    bending,
+    clear_view,
+    front_sheet,
+    misfits,
+    neighbour_pairs,
+)
 from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
@@ -235,9 +244,28 @@ def test_bending_vanishes_on_a_sphere_and_punishes_turned_normals():
     pairs = neighbour_pairs(centre, normal, 0.09)
     assert len(pairs[0]) == 10  # every pair but the two farthest ends
     weight = torch.ones(4)
-    assert bending(centre, normal, weight, pairs, stiffness=0.0).item() == pytest.approx(0, abs=1e-9)
+    i, j = pairs
+    half = (normal[i] - normal[j]) / 2  # what is left on an arc is the turn itself
+    assert torch.allclose(misfits(centre, normal, pairs), STIFFNESS * (half**2).sum(1), atol=1e-9)
     turned = torch.nn.functional.normalize(normal + torch.tensor([0.2, 0.0, 0.0]), dim=1)
-    assert bending(centre, turned, weight, pairs, stiffness=0.0).item() > 0.1
+    assert bending(centre, turned, weight, pairs) > 4 * bending(centre, normal, weight, pairs)
+    # By hand: a pair whose misfit is BEND costs ln 2 in the two directions together.
+    flat = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])
+    rise = BEND / (1 - BEND**2) ** 0.5
+    flat[1, 2] += 0.1 * rise
+    facing = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3)
+    both = torch.tensor([0, 1]), torch.tensor([1, 0])
+    assert bending(flat, facing, torch.ones(2), both).item() == pytest.approx(np.log(2), rel=1e-4)
+
+
+def test_uneven_albedos_cost_by_their_ratio():
+    both = torch.tensor([0, 1]), torch.tensor([1, 0])
+    even, double, more = (albedo_steps(torch.tensor([0.5, x]), both).item() for x in (0.5, 1.0, 2.0))
+    assert even == 0
+    assert double == pytest.approx(
+        np.sqrt((np.log(2) / 0.2) ** 2 + 1) - 1, rel=0.05
+    )  # FAINT moves it a little
+    assert more - double == pytest.approx(np.log(2) / 0.2, rel=0.1)  # nearly linear far out
 
 
 def test_state_restores_the_model():

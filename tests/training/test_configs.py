@@ -23,6 +23,7 @@ from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.commands.train import make_trainer
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.model.objective import Objective
+from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
 
 
@@ -252,13 +253,13 @@ def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, 
     assert set(names("model")) == {"default", "paper", "reference_code", "surface"}
 
 
-def test_the_base_of_a_diagnosis_has_fewer_surfels():
-    """tests/blind and this config speak of the same base."""
-    refined, base = composed()["surfels"], composed(command="diagnose")["surfels"]
-    assert {key: base[key] for key in base if base[key] != refined[key]} == {
-        "surfel_cost": 10.0,
-        "prune": 3.0,
-    }
+def test_the_base_of_a_diagnosis_is_the_surface_of_a_run():
+    """tests/blind and these configs speak of the same base."""
+    assert (
+        composed()["surfels"]
+        == composed(command="diagnose")["surfels"]
+        == dataclasses.asdict(SurfelSettings())
+    )
 
 
 def test_experiments_and_trainers_overrule_what_train_says():
