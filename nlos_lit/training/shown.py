@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +38,11 @@ def shown_spots(n_spots: int, count: int) -> np.ndarray:
     return np.unique(((np.arange(1, count + 1) * GOLDEN) % 1.0 * n_spots).astype(np.int64))
 
 
+def scanned_points(capture: Capture) -> np.ndarray:
+    """``[S, 3]`` wall points that the scan moves, m: the laser's where one sensor point serves all spots."""
+    return capture.laser if capture.kind == "single_sensor" else capture.sensor
+
+
 def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
     """Where each spot is on the wall, for panels of transients.
 
@@ -47,7 +53,7 @@ def spot_labels(capture: Capture, spots: np.ndarray) -> list[str]:
     Returns:
         K labels with x and y in m, of the laser points where one sensor point serves all spots.
     """
-    scanned, name = (capture.laser, "laser") if capture.kind == "single_sensor" else (capture.sensor, "spot")
+    scanned, name = scanned_points(capture), "laser" if capture.kind == "single_sensor" else "spot"
     return [f"{name} at x = {scanned[s, 0]:.2f}, y = {scanned[s, 1]:.2f} m" for s in spots]
 
 
@@ -63,8 +69,42 @@ def transients_of(capture: Capture, spots: np.ndarray, expected: torch.Tensor) -
         a figure with a panel a spot.
     """
     path = capture.path_gate[0] + (np.arange(expected.shape[1]) + 0.5) * capture.bin_length
-    measured = capture.gated_counts()[spots]
-    return figures.transients_plot(measured, expected.cpu().numpy(), path, spot_labels(capture, spots))
+    measured, observed = capture.gated_counts()[spots], capture.gated_observed()
+    return figures.transients_plot(
+        measured, expected.cpu().numpy(), path, spot_labels(capture, spots),
+        observed=None if observed is None else observed[spots],
+    )  # fmt: skip
+
+
+def spot_residuals(
+    capture: Capture, spots: np.ndarray, expected: Callable[[torch.Tensor], torch.Tensor], block: int = 256
+) -> tuple[np.ndarray, np.ndarray]:
+    """What each scanned wall point counted beyond the expected, over all bins that were recorded.
+
+    Args:
+        capture: the measurement.
+        spots: ``[K]`` rows of it; those at the same scanned point are taken together.
+        expected: ``[B, T_gate]`` expected counts of spots ``[B]``.
+        block: spots at once.
+
+    Returns:
+        ``[N, 2]`` x and y of the points, m, and ``[N]`` the residual in standard deviations of its counting
+        noise, 0 where nothing is expected.
+    """
+    observed = capture.gated_observed()
+    first, last = capture.gate
+    totals = []
+    for part in np.split(spots, range(block, len(spots), block)):
+        seen = 1.0 if observed is None else observed[part]
+        mu = expected(torch.from_numpy(part)).double().cpu().numpy()
+        totals.append(
+            np.stack([(capture.counts[part, first:last] * seen).sum(1), (mu * seen).sum(1)], axis=1)
+        )
+    places, row = np.unique(scanned_points(capture)[spots, :2], axis=0, return_inverse=True)
+    counted, meant = np.zeros((2, len(places)))
+    for sums, column in zip((counted, meant), np.concatenate(totals).T, strict=True):
+        np.add.at(sums, row, column)
+    return places, np.divide(counted - meant, np.sqrt(meant), out=np.zeros_like(meant), where=meant > 0)
 
 
 @torch.no_grad()

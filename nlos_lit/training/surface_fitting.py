@@ -14,15 +14,16 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.effects.strengths import report
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.report import figures
-from nlos_lit.report.surface_figures import front_view
+from nlos_lit.report.surface_figures import Front, FrontImage, overview
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.training.capture_fit import CaptureFit
-from nlos_lit.training.shown import transients_of
+from nlos_lit.training.shown import shown_spots, spot_residuals, transients_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+LOOKED_AT = 512  # spots whose residuals are shown while the fit goes on
 SOLID = 0.2  # share of the bright albedo from which on a surfel belongs to the front
 
 
@@ -36,15 +37,16 @@ class SurfaceFitting(CaptureFit):
     Args:
         fit: with its rounds ahead; it is fitted in place.
         scale: counts of one unit of the paper's mean squared error.
+        image: that the surface was seeded from, for the overview.
     """
 
     what = "surface, batches"
 
-    def __init__(self, fit: SurfelFit, scale: float) -> None:
+    def __init__(self, fit: SurfelFit, scale: float, image: FrontImage) -> None:
         super().__init__(scale)
         self.automatic_optimization = False
         self.strict_loading = False  # the fit's own state holds the surfels, see on_save_checkpoint
-        self.fit = fit
+        self.fit, self.image = fit, image
         self.model, self.extension = fit.model, fit.extension
 
     @property
@@ -132,14 +134,14 @@ class SurfaceFitting(CaptureFit):
         return {"loss": train["deviance_per_bin"]}
 
     def figures(self, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
-        """Front view, points, transients and response of the present state.
+        """Overview, points, transients and response of the present state.
 
         Args:
             capture: what is fitted.
             spots: ``[K]`` spots whose transients are shown.
 
         Returns:
-            ``front``, ``surface``, ``transients``, ``laser_sensor`` → figure.
+            ``overview``, ``surface``, ``transients``, ``laser_sensor`` → figure.
         """
         model, expected = self.fit.model, self.expected(torch.from_numpy(spots).to(self.device))
         sensor = model.laser_sensor
@@ -147,13 +149,28 @@ class SurfaceFitting(CaptureFit):
             psi = sensor.kernel().cpu().numpy()
         title = f"{len(model)} surfels after {self.fit.done} batches"
         return {
-            "front": front_view(*front(model), title=title),
+            "overview": self.overview(shown_spots(capture.n_spots, LOOKED_AT), title),
             "surface": figures.surface_plot(model.points()),
             "transients": transients_of(capture, spots, expected),
             "laser_sensor": figures.laser_sensor_plot(
                 psi, capture.bin_length, first=-sensor.lead * capture.bin_length
             ),
         }
+
+    def overview(self, spots: np.ndarray, title: str) -> Figure:
+        """Phasor image, albedo, depth, normals and residuals of the present state, side by side.
+
+        Args:
+            spots: ``[K]`` whose residuals are shown.
+            title: of the figure.
+
+        Returns:
+            a figure, see :func:`~nlos_lit.report.surface_figures.overview`.
+        """
+        places, residuals = spot_residuals(
+            self.fit.capture, spots, lambda part: self.expected(part.to(self.fit.model.laser.device))
+        )
+        return overview(self.image, front(self.fit.model), places, residuals, title)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Keep the fit's whole state, and it alone: surfels and optimiser are part of it."""
@@ -174,24 +191,20 @@ class SurfaceFitting(CaptureFit):
         self.model = self.fit.model
 
 
-def front(model: SurfelModel) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What one sees of surfels that are not faint, on their lateral cells: in each the nearest to the wall.
-
-    Args:
-        model: the surfels.
-
-    Returns:
-        albedo ``[nx, ny]`` and z ``[nx, ny]`` (m), NaN for nothing; centres of cells ``[nx]``, ``[ny]``, m.
-    """
+def front(model: SurfelModel) -> Front:
+    """What the wall sees of surfels that are not faint: in each lateral cell the nearest."""
     points, cells = model.points(), model.lateral
     x, y = (o + p * np.arange(n) for o, p, n in zip(cells.origin, cells.pitch, cells.shape, strict=True))
     index = np.round((points.positions[:, :2] - cells.origin) / cells.pitch).astype(np.int64)
     bright = SOLID * np.quantile(points.albedo, 0.98)
-    seen = (points.albedo >= bright) & ((index >= 0) & (index < cells.shape)).all(1)
-    order = np.flatnonzero(seen)[
-        np.argsort(-points.positions[seen, 2], kind="stable")
-    ]  # the nearest comes last
-    albedo, depth = np.full((2, *cells.shape), np.nan)
-    albedo[tuple(index[order].T)] = points.albedo[order]
-    depth[tuple(index[order].T)] = points.positions[order, 2]
-    return albedo, depth, x, y
+    seen = np.flatnonzero((points.albedo >= bright) & ((index >= 0) & (index < cells.shape)).all(1))
+    order = seen[np.argsort(-points.positions[seen, 2], kind="stable")]  # the nearest comes last
+
+    def on_lattice(values: np.ndarray) -> np.ndarray:
+        drawn = np.full((*cells.shape, *values.shape[1:]), np.nan)
+        drawn[tuple(index[order].T)] = values[order]
+        return drawn
+
+    return Front(
+        on_lattice(points.albedo), on_lattice(points.positions[:, 2]), on_lattice(points.normals), x, y
+    )

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
+import shlex
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
@@ -18,22 +21,27 @@ from nlos_lit.effects.strengths import report
 from nlos_lit.io.files import whole_file
 from nlos_lit.io.meshes import write_mesh
 from nlos_lit.io.points import write_points
+from nlos_lit.metrics.excess import Excess, excess_by_axis
 from nlos_lit.model.build import normalisation
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
-from nlos_lit.report.surface_figures import front_view
+from nlos_lit.report.surface_figures import FrontImage
+from nlos_lit.report.words import AXES
 from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.surfels.fitted import fitted_surfels
+from nlos_lit.surfels.fitted import FittedSurfels, fitted_surfels
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.start import seed_surfels
 from nlos_lit.training.configs import settings_of
 from nlos_lit.training.outcome import geometry_of
 from nlos_lit.training.run_folder import Run
 from nlos_lit.training.shown import shown_spots, transients_of
-from nlos_lit.training.surface_fitting import SurfaceFitting, front
+from nlos_lit.training.surface_fitting import SurfaceFitting
 
 log = logging.getLogger(__name__)
+
+TELLING = 0.02  # share of counting noise from which on a surface is said to miss something
+SAID = 0.05  # share of the whole excess from which on an axis is named
 
 
 def prepare_surface(run: Run, laser_sensor: LaserSensor | None = None) -> SurfaceFitting:
@@ -64,7 +72,9 @@ def prepare_surface(run: Run, laser_sensor: LaserSensor | None = None) -> Surfac
         scan_shapes=True,
     )
     log.info("%d surfels at the maxima of the image; %d batches and more", len(fit.model), fit.ahead)
-    return SurfaceFitting(fit, normalisation(run.capture))
+    grid = phasor.grid
+    image = FrontImage(intensity.amax(0).numpy(), grid.x, grid.y)
+    return SurfaceFitting(fit, normalisation(run.capture), image)
 
 
 def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -> dict[str, Any]:
@@ -77,8 +87,8 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
         began: ``time.perf_counter()`` of when the surface was begun.
 
     Returns:
-        The summary's entry: scores on all held-out spots, imaging parameters, effects, geometry errors where
-        truth is known.
+        The summary's entry: scores on all held-out spots, what they leave above noise (None without photon
+        statistics), imaging parameters, effects, geometry errors where truth is known.
     """
     capture, export = run.capture, run.config["export"]
     found = fitted_surfels(module.fit, run.data.heldout_spots, began)
@@ -94,14 +104,20 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
     shown = {
         "transients": transients_of(capture, spots, found.expected(torch.from_numpy(spots))),
         "surface": figures.surface_plot(points),
-        "front": front_view(*front(found.model), title=f"{len(points)} surfels"),
+        "overview": module.overview(np.arange(capture.n_spots), f"{len(points)} surfels"),
     }
     for name, figure in shown.items():
         save_figure(figure, place / f"{name}.png")
     assert found.heldout is not None  # held-out spots were given
+    excess = heldout_excess(run, found) if capture.is_counts else None
+    note = None if excess is None else excess_note(excess, place.parent)
+    if note is not None:
+        log.info(note)
     return {
         "surfels": len(found.model),
         "heldout": dataclasses.asdict(found.heldout),
+        "excess": None if excess is None else dataclasses.asdict(excess),
+        "note": note,
         "parameters": {
             name: {"value": value, "unit": unit} for name, (value, unit) in found.parameters.items()
         },
@@ -110,6 +126,59 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
         "seconds": found.seconds,
         "mesh": {"vertices": mesh.vertices, "triangles": mesh.triangles, "reason": mesh.reason},
     }
+
+
+def heldout_excess(run: Run, found: FittedSurfels) -> Excess:
+    """What the held-out spots leave above counting noise, by axis.
+
+    Args:
+        run: the capture's, with photon statistics.
+        found: the fitted surface.
+
+    Returns:
+        shares along the axes; the scan's stretches are the rows of its raster, √S where it has none.
+    """
+    capture, held = run.capture, run.data.heldout_spots
+    observed, shape = capture.gated_observed(), capture.scan_shape
+    rows = shape[0] if shape is not None and len(shape) == 2 else math.isqrt(capture.n_spots)
+    index = torch.from_numpy(held)
+    first, last = capture.gate
+    return excess_by_axis(
+        torch.from_numpy(capture.counts[held, first:last].astype(np.float64)),
+        found.expected(index),
+        [place[index] for place in Scan.of(capture).places],
+        torch.from_numpy(capture.scan_order[held] * rows // capture.n_spots),
+        None if observed is None else torch.from_numpy(observed[held]),
+    )
+
+
+def excess_note(excess: Excess, folder: Path) -> str | None:
+    """One sentence on a surface that does not reach the noise; None on one that does.
+
+    Args:
+        excess: of the held-out spots.
+        folder: of the run.
+
+    Returns:
+        by how much, along which two axes most of it lies, and what can be asked next.
+
+    Examples:
+        >>> found = Excess(0.07, 1.07, {"level": 0.0, "time": 0.41, "wall": 0.22, "scan": 0.1, "rate": 0.0})
+        >>> print(excess_note(found, Path("outputs/su")).replace(" (", "\\n(").replace("; ", ";\\n"))
+        the fitted surface leaves 7 % more than counting noise
+        (of it 41 % along the time axis, 22 % across the wall);
+        python diagnose.py run=outputs/su asks what is missing
+    """
+    if excess.ratio <= 1 + TELLING:
+        return None
+    words = AXES | {"level": "in the overall level"}
+    most = sorted(excess.along, key=lambda name: -excess.along[name])[:2]
+    where = [f"{100 * excess.along[name]:.0f} % {words[name]}" for name in most if excess.along[name] >= SAID]
+    return (
+        f"the fitted surface leaves {100 * (excess.ratio - 1):.0f} % more than counting noise "
+        f"({'of it ' + ', '.join(where) if where else 'hardly any along time, wall, scan or rate'}); "
+        f"python diagnose.py {shlex.quote(f'run={folder}')} asks what is missing"
+    )
 
 
 def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Extension]:

@@ -18,22 +18,26 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.scan import Scan
 from nlos_lit.commands.train import surface_settings
 from nlos_lit.io.points import read_points
+from nlos_lit.metrics.excess import Excess
+from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.runtime.command_line import quiet_libraries
-from nlos_lit.surfels.fitted import score_spots
+from nlos_lit.surfels.fitted import fitted_surfels, score_spots
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import compose
 from nlos_lit.training.run_folder import Run, fitted_of, open_run, prepare_run
 from nlos_lit.training.surface_fitting import SurfaceFitting, front
-from nlos_lit.training.surface_run import load_refined, prepare_surface
+from nlos_lit.training.surface_run import excess_note, heldout_excess, load_refined, prepare_surface
 
 SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
     "trainer.check_val_every_n_epoch=5", "callbacks.checkpoint.every_n_epochs=1",
-    "callbacks.figures.every=20", "surfels.rounds=2", "surfels.steps=8", "surfels.more=1", "threads=1",
+    "callbacks.figures.every=20", "surfels.contest=4", "surfels.rounds=2", "surfels.steps=8",
+    "surfels.more=1", "threads=1",
 ]  # fmt: skip
 EFFECTS = "effects=[irf_tail,wall_reflectance]"
 
@@ -94,25 +98,25 @@ def test_a_trainer_takes_the_same_steps_stopped_or_not(run, tmp_path):
     by_hand, whole, part = seeded(run), seeded(run), seeded(run)
     start = by_hand.fit.state()
     by_hand.fit.finish()
-    assert len(by_hand.fit.history) == 3  # one round was added
+    assert len(by_hand.fit.history) == 4  # one round was added
     trainer_of(tmp_path / "whole").fit(whole, datamodule=run.data)
     assert same(whole.fit.state(), by_hand.fit.state())
     assert not same(start["model"], by_hand.fit.state()["model"])
-    stopped = (5, 16, 29)  # in a round, between two, in the second
+    stopped = (2, 9, 12, 31)  # in the contest, in a round, between two, in the last
     for epochs in stopped:
         place, go_on = tmp_path / "part", tmp_path / "part" / "last.ckpt"
         trainer = trainer_of(place, epochs)
         before = go_on if go_on.exists() else None
         trainer.fit(part, datamodule=run.data, ckpt_path=before, weights_only=True if before else None)
         assert (part.fit.done, trainer.global_step) == (epochs, epochs)
-        assert part.fit.in_round == (epochs != 16)
+        assert part.fit.in_round == (epochs != 12)
         part = seeded(run)
     trainer = trainer_of(place)
     trainer.fit(part, datamodule=run.data, ckpt_path=go_on, weights_only=True)
     assert same(part.fit.state(), by_hand.fit.state())
     assert part.scores == whole.scores
     assert part.scores["final"]["deviance_per_bin"] < part.scores["initial"]["deviance_per_bin"]
-    assert trainer.callbacks[1].ran == part.fit.done - 29
+    assert trainer.callbacks[1].ran == part.fit.done - 31
     again = seeded(run)
     trainer = trainer_of(place)
     trainer.fit(again, datamodule=run.data, ckpt_path=go_on, weights_only=True)
@@ -151,12 +155,63 @@ def test_the_front_is_the_nearest_surfel_of_each_cell_that_is_not_faint(run):
     places = np.column_stack([origin + cells * pitch, [0.8, 0.6, 0.5, 0.7]])
     up = torch.tensor([0.0, 0.0, -1.0]).expand(4, 3)
     model.place(torch.from_numpy(places), up, torch.tensor([1.0, 0.5, 0.01, 0.9]))
-    albedo, depth, x, y = front(model)
-    assert depth[2, 3] == pytest.approx(0.6)
-    assert albedo[2, 3] == pytest.approx(0.5)
-    assert depth[4, 1] == pytest.approx(0.7)
-    assert np.isfinite(depth).sum() == np.isfinite(albedo).sum() == 2
-    assert (x[2], y[3]) == pytest.approx(tuple(places[0, :2]))
+    seen = front(model)
+    assert seen.depth[2, 3] == pytest.approx(0.6)
+    assert seen.albedo[2, 3] == pytest.approx(0.5)
+    assert seen.depth[4, 1] == pytest.approx(0.7)
+    assert seen.normals[2, 3] == pytest.approx([0, 0, -1])
+    assert [np.isfinite(v).sum() for v in (seen.depth, seen.albedo, seen.normals)] == [2, 2, 6]
+    assert (seen.x[2], seen.y[3]) == pytest.approx(tuple(places[0, :2]))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "along", "sentence"),
+    [
+        (1.019, {"time": 0.9}, None),
+        (
+            1.3,
+            {"level": 0.2, "time": 0.04},
+            "30 % more than counting noise (of it 20 % in the overall level);",
+        ),
+        (1.1, {"time": 0.04, "scan": 0.0}, "10 % more than counting noise (hardly any along time, wall,"),
+        (
+            1.1,
+            {"rate": 0.1, "wall": 0.2, "scan": 0.3},
+            "(of it 30 % over the course of the scan, 20 % across the",
+        ),
+    ],
+)
+def test_a_surface_that_misses_the_noise_says_so(ratio, along, sentence):
+    note = excess_note(Excess(0.1, ratio, along), Path("outputs/my run"))
+    if sentence is None:
+        assert note is None
+    else:
+        assert sentence in note
+        assert note.endswith("; python diagnose.py 'run=outputs/my run' asks what is missing")
+
+
+def test_a_gain_over_the_wall_that_no_surface_makes_is_told(run):
+    """Counts drawn from the surfels are noise alone; a gain that grows to the right is the wall's."""
+    module = seeded(run)
+    capture = run.capture
+    first, last = capture.gate
+    found = fitted_surfels(module.fit, run.data.heldout_spots, 0.0)
+    sensor = found.model.laser_sensor
+    for name in ("intensity", "background"):  # many counts, so that little is left to chance
+        value = 20 * getattr(sensor, name)().item()
+        setattr(sensor, name, BoundedParameter(value, value / 10, value * 10, ""))
+    mu = found.expected(torch.arange(capture.n_spots)).double()
+    gain = 1 + 0.5 * Scan.of(capture).places[0][:, :1]
+    along = []
+    for true in (mu, gain * mu):
+        counts = np.zeros(capture.counts.shape, dtype=np.float32)
+        counts[:, first:last] = torch.poisson(true, generator=torch.Generator().manual_seed(0)).numpy()
+        again = copy.copy(run)
+        again.capture = capture.with_counts(counts)
+        along.append(heldout_excess(again, found).along)
+    assert max(along[0].values()) == 0
+    assert max(along[1], key=along[1].get) == "wall"
+    assert along[1]["wall"] > 0.7
 
 
 @pytest.fixture(scope="module")
@@ -171,12 +226,16 @@ def test_the_door_leaves_a_surface(finished):
     refined, heldout = summary["refined"], summary["heldout"]
     assert heldout["nmse"]["final"] < heldout["nmse"]["initial"]
     assert refined["heldout"]["nmse"] == pytest.approx(heldout["nmse"]["final"], rel=1e-3)
-    assert summary["iterations"] == 16 + 16 + 16
+    assert summary["iterations"] == 4 + 8 + 16 + 16
     assert {"sigma_ls", "irf_tail.fraction", "wall_reflectance.rms"} <= set(summary["parameters"])
     place = finished / "refined"
     assert {path.name for path in place.iterdir()} >= {
-        "points.ply", "surfels.pt", "effects.pt", "transients.png", "surface.png", "front.png",
+        "points.ply", "surfels.pt", "effects.pt", "transients.png", "surface.png", "overview.png",
     }  # fmt: skip
+    excess, scored = refined["excess"], refined["heldout"]
+    assert excess["ratio"] == pytest.approx(scored["deviance_per_bin"] / scored["deviance_noise"], rel=1e-5)
+    assert set(excess["along"]) == {"level", "time", "wall", "scan", "rate"}
+    assert (refined["note"] is None) == (excess["ratio"] <= 1.02)
     assert len(read_points(place / "points.ply")) == refined["surfels"]
     model, extension = load_refined(finished, prepare_run(compose("train", SMALL)).capture)
     assert (len(model), len(extension.effects)) == (refined["surfels"], 2)
@@ -190,10 +249,10 @@ def test_events_hold_the_way_of_the_surface(finished):
         "loss/total", "loss/counts", "loss/bending", "deviance", "surfels", "heldout/deviance_per_bin",
         "parameters/sigma_ls", "parameters/irf_tail.fraction",
     } <= set(tags["scalars"])  # fmt: skip
-    assert len(events.Scalars("deviance")) == 48
+    assert len(events.Scalars("deviance")) == 44
     assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
-    assert {"front", "surface", "transients", "laser_sensor"} <= set(tags["images"])
-    assert len(events.Images("front")) == 4  # at the start, after 20 and 40, at the end
+    assert {"overview", "surface", "transients", "laser_sensor"} <= set(tags["images"])
+    assert len(events.Images("overview")) == 4  # at the start, after 20 and 40, at the end
 
 
 CTRL_C = """
