@@ -22,6 +22,7 @@ class Excess:
     Args:
         per_bin: mean Poisson deviance of a bin, less that of pure noise.
         ratio: mean Poisson deviance of a bin over that of pure noise; 1 is perfect.
+        error: standard error of that ratio, from how much the bins' deviances scatter.
         along: ``level``, ``time``, ``wall``, ``scan``, ``rate`` → share of the whole excess that is
             structured along it, from 0 (nothing beyond noise) to 1. Axes overlap: shares need not add up
             to 1.
@@ -29,6 +30,7 @@ class Excess:
 
     per_bin: float
     ratio: float
+    error: float
     along: dict[str, float]
 
 
@@ -69,7 +71,8 @@ def excess_by_axis(
     """
     counts, expected = counts.double(), expected.double()
     seen = torch.ones_like(counts, dtype=torch.bool) if observed is None else observed
-    deviance, noise = poisson_deviance(counts[seen], expected[seen]).mean(), expected_deviance(expected[seen])
+    deviances, noise = poisson_deviance(counts[seen], expected[seen]), expected_deviance(expected[seen])
+    deviance = deviances.mean()
     variance = expected * seen
     residual = (counts - expected) * seen
     per_spot = residual.sum(1), variance.sum(1)
@@ -89,6 +92,7 @@ def excess_by_axis(
     return Excess(
         per_bin=float(deviance - noise),
         ratio=float(deviance / noise),
+        error=float(deviances.std() / len(deviances) ** 0.5 / noise),
         along={name: _share(*value, whole) for name, value in found.items()},
     )
 
