@@ -38,7 +38,7 @@ class SurfelSettings:
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
         max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None makes them at most three bins of path wide.
+        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has

@@ -19,7 +19,7 @@ from nlos_lit.surfels.growth import rank_one, score, start_response, volume_maxi
 from nlos_lit.surfels.model import Lateral, SurfelModel, points_along
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
-WIDEST = 3.0  # bins of path that a surfel's side spans at most; docs/surface.md says what wider ones cost
+WIDEST = 4.0  # bins of path that a surfel's side spans at most; docs/surface.md says what wider ones cost
 RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
 
 
@@ -69,7 +69,8 @@ def seed_surfels(
         raise UserError(
             "the training spots hold no counts inside the gate; check the gate and the held-out spots"
         )
-    lateral = Lateral(tuple(grid.origin[:2]), tuple(grid.pitch[:2]), tuple(grid.shape[1:]))
+    (x, y, _), (dx, dy, _), (_, nx, ny) = grid.origin, grid.pitch, grid.shape
+    lateral = Lateral((x, y), (dx, dy), (nx, ny))
     sensor = start_response(capture, counts, laser_sensor_start)
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(train), generator=generator)

@@ -19,7 +19,7 @@ from nlos_lit.inference.criticise import CriticismSettings, look
 from nlos_lit.inference.split import split_spots
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-QUICK = dataclasses.replace(SURFELS, rounds=2, steps=60, more=0)
+QUICK = dataclasses.replace(SURFELS, contest=60, rounds=2, steps=120, more=0)
 NEARLY = 0.8  # share of the first one's predicted gain: whole diagnoses refit several rivals
 UNSEEN = {
     "wall_tilt": "a tilted wall and a turned scene are the same to second order",
