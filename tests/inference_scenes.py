@@ -99,9 +99,10 @@ def surfels(scene: Capture, number: int = 12, level: float = 1.0) -> SurfelModel
 
 
 def hide_some(model: SurfelModel) -> None:
-    """A quarter of the surfels is hidden from each wall point."""
+    """A quarter of the surfels is hidden from each wall point, but for three tenths of their light."""
     shape = (len(model.laser), len(model))
     model.visible = torch.from_numpy(np.random.default_rng(8).random(shape) > 0.25)
+    model.set_passing(0.3)
 
 
 def effect_of(name: str, scan: Scan, **values: float | Tensor) -> Effect:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 
 NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to exp(-1/2)
 RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present normal by far, none do not
+AVERAGES = 6  # over neighbours, by which a shift is carried along a sheet
 STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the places
 BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
 STEP = 0.2  # of ln(albedo): smaller differences cost little
@@ -51,13 +53,15 @@ def neighbour_pairs(
 
 
 class Sheet(NamedTuple):
-    """How the normal of each of M surfels follows from the places of its neighbours, while these move."""
+    """How each of M surfels follows its neighbours while these move: with its normal, and with its place."""
 
     pairs: tuple[Tensor, Tensor]  # i and j [P], from neighbour_pairs
     normal: Tensor  # [M, 3] unit, about which surfaces lean
     first: Tensor  # [M, 3] unit, across the normal
     second: Tensor  # [M, 3] unit, across both
     share: Tensor  # [P, 2] slopes along both, per metre that j stands out of i's plane
+    mean: Tensor  # [P] share of j in the average about i
+    own: Tensor  # [M] share of i in it
 
 
 def lay_sheet(
@@ -76,7 +80,7 @@ def lay_sheet(
         cell: lateral extent of a surfel, m.
 
     Returns:
-        what :func:`sheet_normals` needs.
+        what :func:`sheet_normals` and :func:`carry_along` need.
     """
     i, j = pairs
     helper = torch.where(
@@ -93,7 +97,35 @@ def lay_sheet(
     normal_equations = torch.zeros(len(centre), 2, 2, device=centre.device).index_add(0, i, square)
     normal_equations = normal_equations + RIDGE * cell**2 * torch.eye(2, device=centre.device)
     share = torch.linalg.solve(normal_equations[i], trust[:, None] * along)
-    return Sheet(pairs, normal, first, second, share)
+    total = weight.clamp_min(1e-6).index_add(0, i, trust)
+    return Sheet(pairs, normal, first, second, share, trust / total[i], weight.clamp_min(1e-6) / total)
+
+
+def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
+    """What shifts of single surfels move when neighbours come along: ``AVERAGES`` averages over neighbours.
+
+    A shift of all surfels of a sheet stays what it is; that of a single one is spread over those within
+    about three cells. Gradients are summed over as many, so that what they agree on moves the sheet as one.
+
+    Args:
+        sheet: from :func:`lay_sheet`.
+        shift: ``[M]``, differentiable.
+
+    Returns:
+        ``[M]``.
+
+    Examples:
+        >>> import torch
+        >>> row = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.9, 0.0, 1.0]])
+        >>> facing = torch.tensor([0.0, 0.0, -1.0]).expand(3, 3)
+        >>> sheet = lay_sheet(row, facing, torch.ones(3), neighbour_pairs(row, facing, 0.2), 0.1)
+        >>> [round(x, 2) for x in carry_along(sheet, torch.tensor([1.0, 0.0, 2.0])).tolist()]
+        [0.5, 0.5, 2.0]
+    """
+    i, j = sheet.pairs
+    for _ in range(AVERAGES):
+        shift = (sheet.own * shift).index_add(0, i, sheet.mean * shift[j])
+    return shift
 
 
 def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
@@ -228,12 +260,12 @@ def clear_view(
     target: Tensor,
     samples: int,
     skip: float,
-    chunk: int = 1 << 22,
+    chunk: int = 1 << 18,
 ) -> Tensor:
     """Which straight lines from wall points to targets do not pierce the front sheet.
 
     A line pierces the sheet where, between two samples in occupied cells, it goes from before it to behind
-    it; lines that pass behind a sheet's edge are clear.
+    it; lines that pass behind a sheet's edge are clear. Lines are looked at from the sheet's nearest cell on.
 
     Args:
         sheet: ``[nx, ny]`` from :func:`front_sheet`, m.
@@ -241,29 +273,37 @@ def clear_view(
         pitch: ``[2]`` signed spacing of cells, m.
         wall: ``[W, 3]`` wall points, m.
         target: ``[V, 3]`` m.
-        samples: looked at along each line.
+        samples: looked at on a line all of which is beyond the nearest cell; fewer on others.
         skip: within this many cells of the target nothing hides it.
-        chunk: samples worked on at once, bounds the memory.
+        chunk: samples worked on at once: what a processor's cache holds.
 
     Returns:
         ``[W, V]`` bool, True where the view is clear.
     """
     nx, ny = sheet.shape
+    clear = torch.ones(len(wall), len(target), dtype=torch.bool, device=wall.device)
+    nearest, front = sheet.min(), wall[:, 2].max()
+    late = torch.nonzero(target[:, 2] > nearest)[:, 0]
+    if not len(late) or not torch.isfinite(nearest):
+        return clear
+    target = target[late]
     flat = torch.nn.functional.pad(sheet, (1, 1, 1, 1), value=torch.inf).reshape(-1)
-    share = (torch.arange(samples, device=wall.device) + 0.5) / samples
-    rows = []
-    for part in wall.split(max(1, chunk // (len(target) * samples))):
-        d = target[None] - part[:, None]
-        far = (1 - share) * torch.linalg.vector_norm(d, dim=2, keepdim=True) > skip * pitch.abs().max()
-        i = ((part[:, None, None, 0] + share * d[..., :1] - origin[0]) / pitch[0]).round().clamp(
-            -1, nx
-        ).long() + 1
-        j = ((part[:, None, None, 1] + share * d[..., 1:2] - origin[1]) / pitch[1]).round().clamp(
-            -1, ny
-        ).long() + 1
-        height = flat[i * (ny + 2) + j]
-        behind = part[:, None, None, 2] + share * d[..., 2:] > height
-        solid = torch.isfinite(height)
-        pierced = ~behind[..., :-1] & behind[..., 1:] & solid[..., :-1] & solid[..., 1:] & far[..., 1:]
-        rows.append(~pierced.any(2))
-    return torch.cat(rows)
+    whole = target[:, 2].max() - front
+    count = max(2, math.ceil(samples * float(((target[:, 2].max() - nearest) / whole).clamp(0, 1))))
+    step = torch.arange(count, device=wall.device) / count
+    for part in range(0, len(wall), size := max(1, chunk // (len(target) * count))):
+        points = wall[part : part + size, None]
+        d = target[None] - points
+        start = ((nearest - points[..., 2]) / d[..., 2]).clamp(0, 1)[..., None]
+        share = start + (1 - start) * step
+        far = share < 1 - skip * pitch.abs().max() / torch.linalg.vector_norm(d, dim=2, keepdim=True)
+        cell = ((points[..., :2] - origin) / pitch + 1)[..., None] + share[:, :, None] * (d[..., :2] / pitch)[
+            ..., None
+        ]
+        cell = cell.round_()
+        i, j = cell[:, :, 0].clamp_(0, nx + 1), cell[:, :, 1].clamp_(0, ny + 1)
+        height = flat[(i * (ny + 2) + j).long()]
+        behind = points[..., 2:] + share * d[..., 2:] > height
+        before = ~behind & torch.isfinite(height)
+        clear[part : part + size, late] = ~(before[..., :-1] & behind[..., 1:] & far[..., 1:]).any(2)
+    return clear

@@ -55,7 +55,8 @@ def move_base(fit: SurfelFit, present: Extension, step: Tensor) -> None:
     model.raw_normal.copy_(
         normal + (fields @ across)[:, None] * sides[0] + (fields @ along)[:, None] * sides[1]
     )
-    for parameter in model.laser_sensor.parameters():
+    hiding = [model.raw_passing] if len(model.visible) else []
+    for parameter in [*model.laser_sensor.parameters(), *hiding]:
         parameter.add_(rest[0].clamp(-MOST_RESPONSE, MOST_RESPONSE))
         rest = rest[1:]
     for effect in present.effects:

@@ -5,7 +5,8 @@ Rows are gated bins of the looked-at spots, divided by √μ, so that counts of 
 variance.
 
 - ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, smooth tilts of all
-  normals, the laser-sensor response, and the parameters of effects that were accepted before.
+  normals, the laser-sensor response, what passes the sheets in front, and the parameters of effects that were
+  accepted before.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -80,7 +82,7 @@ def build_problem(
     """
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
-    m = len(model)
+    m, first = len(model), model.gate[0]
     tilts = tilt_fields(model)
     size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
     surfels, others, light = [], [], []
@@ -90,9 +92,10 @@ def build_problem(
             light.append(model.transients(model.paths(part), part, extension))
         surfels.append(_surfel_columns(model, extension, part, light[-1], tilts))
         forward = _recording(model, extension, part, light[-1])
-        both = [
-            _jvp(forward, name, p, torch.ones_like(p))[:, model.gate[0] :] for name, p in response.items()
-        ]
+        both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
+        if len(model.visible):
+            whole = _Forward(model, extension, partial(_render, part))
+            both.append(_jvp(whole, "model.raw_passing", model.raw_passing, torch.tensor(1.0)))
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot]
@@ -216,6 +219,10 @@ def _staged(
     return _Forward(model, extension, lambda m, e: e.counting(light, spots))
 
 
+def _render(spots: Tensor, model: SurfelModel, extension: Extension) -> Tensor:
+    return model.render(spots, extension)
+
+
 def _recording(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> _Forward:
     return _Forward(model, extension, lambda m, e: m.record(transients, spots, e))
 
@@ -248,7 +255,7 @@ def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, 
     unit = albedo_unit(albedo)
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)
-    seen = model.visible[spots][:, :, None] if len(model.visible) else 1.0
+    seen = model.arriving(model.visible[spots])[:, :, None] if len(model.visible) else 1.0
 
     def place(rho: Tensor, depth: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
         leaning = torch.nn.functional.normalize(normal + a[:, None] * across + b[:, None] * along, dim=1)

@@ -24,7 +24,7 @@ from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
-WORTH = 0.02  # nats a parameter that another round must gain
+WORTH = 0.05  # nats a parameter that another round must gain
 FAINTEST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -72,7 +72,7 @@ class SurfelSettings:
     effect_rate: float = 0.1
     bending: float = 0.5
     evenness: float = 0.5
-    surfel_cost: float = 3.0
+    surfel_cost: float = 1.5
     test_spots: int = 384
     visibility: bool = True
 
@@ -352,7 +352,8 @@ class SurfelFit:
         if self.plan or not self.more:
             return
         deviance, noise = self._deviance()
-        parameters = sum(p.numel() for p in [*self.model.parameters(), *self.extension.parameters()])
+        others = [*self.model.laser_sensor.parameters(), *self.extension.parameters()]
+        parameters = 2 * len(self.model) + sum(p.numel() for p in others)  # a place and an albedo each
         gained = (self.before - deviance) * self.counts.numel() / 2
         if deviance > noise and gained >= WORTH * parameters:
             self.plan = rounds_of(self.settings.steps, 1, settle=False, grow_first=True)
@@ -406,8 +407,8 @@ class SurfelFit:
         s, model = self.settings, self.model
         # The response waits for the places: it would otherwise settle around errors of the seeds.
         response_rate = s.response_rate * (0.3 if self.plan[0].settling else 1.0)
-        settled = [] if self.plan[0].contest else [model.raw_depth]
-        response = [] if self.plan[0].contest else list(model.laser_sensor.parameters())
+        settled = [] if self.plan[0].contest else [model.raw_depth, model.raw_shift]
+        response = [] if self.plan[0].contest else [*model.laser_sensor.parameters(), model.raw_passing]
         groups = [
             {"params": settled, "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
@@ -485,7 +486,8 @@ class SurfelFit:
         self.model.link()
         sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
         loss = float(np.mean(self.losses[-len(self.losses) // 4 :]))
-        self.history.append({"surfels": len(self.model), "loss": loss, **sensor})
+        passing = self.model.passing().item()
+        self.history.append({"surfels": len(self.model), "loss": loss, **sensor, "passing": passing})
         self.plan, self.losses, self.optimizer = self.plan[1:], [], None
         self._add_round()
 

@@ -182,7 +182,7 @@ def score(
         expected: ``[B, T_gate]`` of the spots.
         spots: ``[B]`` rows of the capture that are looked at.
         hooks: effects, whose response is applied.
-        visible: ``[B, V]`` which places the spots see; None: all.
+        visible: ``[B, V]`` share of each place's light that the spots see; None: all.
 
     Returns:
         score and information of each place's albedo.
@@ -329,25 +329,24 @@ APART = 0.7  # surfels keep this many cells from each other
 FIRST_SHARE = 0.5  # of the best albedo: neighbours that grow together share the same residual
 ALIKE = 0.7  # deviation of ln(albedo) that a continued sheet is given
 ALBEDOS = (0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0)  # of its neighbour's, that are tried
-MOST_SUPPORT = 4.0  # nats that neighbours give at most
 LONE = 12.0  # nats, 5 standard deviations, that a surfel without a sheet must gain
 
 
 @torch.no_grad()
 def support(model: SurfelModel) -> Tensor:
-    """Nats that neighbours speak for each surfel: one each in its own plane, none at a right angle.
+    """Nats that neighbours speak for each surfel: one where a bright one lies in its plane, else less.
 
     Args:
         model: the surfels, linked.
 
     Returns:
-        ``[M]``, at most ``MOST_SUPPORT``.
+        ``[M]`` from 0 to 1.
     """
     i, j = model.pairs
     misfit = misfits(model.centre(), model.normal(), model.pairs)
     agree = 1 - torch.log1p(misfit / BEND**2) / math.log1p(1 / BEND**2)
-    given = model.trust()[j] * agree
-    return torch.zeros(len(model), device=given.device).index_add(0, i, given).clamp_max(MOST_SUPPORT)
+    none = torch.zeros(len(model), device=agree.device)
+    return none.scatter_reduce(0, i, model.trust()[j] * agree, "amax")
 
 
 def dispersion(significance: Tensor) -> float:
@@ -445,7 +444,9 @@ def prune_and_grow(
         return (places[:, 2] > low) & (places[:, 2] < high)
 
     present, albedo = Seeds(model.centre(), model.normal()), model.albedo()
-    information = test(present, model.quadrature, model.visible[spots] if len(model.visible) else None)[1]
+    hidden = len(model.visible) > 0
+    seen_now = model.arriving(model.visible[spots]) if hidden else None
+    information = test(present, model.quadrature, seen_now)[1]
     worth = albedo.double() ** 2 * information / 2 + support(model)
     kept = (worth > cost) & inside(present.centre)
     if not kept.any():
@@ -454,17 +455,21 @@ def prune_and_grow(
             "maxima"
         )
     apart = APART * float(model.cell.max())
+
+    def shown(places: Seeds) -> Score:
+        return test(places, 1, model.arriving(model.sees(spots, places.centre)) if hidden else None)
+
     places, source = continuations(*present, model.cell)
     free = ~occupied(places.centre, present.centre, apart) & inside(places.centre)
     free &= places.normal[:, 2] < 0.2
     places, source = places.take(free), source[free]
-    result = test(places, 1)
+    result = shown(places)
     gain, light = continuing_gain(result, albedo[source], dispersion(result.significance))
     wanted = gain > cost
     places, gain, light = places.take(wanted), gain[wanted], light[wanted]
 
     others = facings(reserve.take(~occupied(reserve.centre, present.centre, apart) & inside(reserve.centre)))
-    result = test(others, 1)
+    result = shown(others)
     lone = result.significance.clamp_min(0) ** 2 / 2 / dispersion(result.significance)
     begun = lone > LONE
     others = others.take(begun)

@@ -16,6 +16,7 @@ from nlos_lit.functional.surfel_graph import (
     Sheet,
     albedo_steps,
     bending,
+    carry_along,
     clear_view,
     front_sheet,
     lay_sheet,
@@ -59,6 +60,8 @@ class SurfelModel(nn.Module):
         lateral: cells of the surfels.
         laser_sensor: from :func:`spline_sensor`.
         quadrature: points along each side of a surfel.
+
+    What stands in front hides all, until :meth:`set_passing`.
 
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
@@ -108,6 +111,7 @@ class SurfelModel(nn.Module):
         self.register_buffer("observed", torch.from_numpy(seen), persistent=False)
         cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
         self.register_buffer("cell", cell, persistent=False)
+        self.raw_passing = nn.Parameter(torch.tensor(-math.inf))
         self.place(centre, normal, albedo)
 
     def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
@@ -128,6 +132,7 @@ class SurfelModel(nn.Module):
         self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
+        self.raw_shift = nn.Parameter(torch.zeros(len(centre), device=device))  # neighbours come along
         self.raw_normal = nn.Parameter(normal)
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
@@ -149,7 +154,9 @@ class SurfelModel(nn.Module):
 
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
-        return self.anchor + (self.raw_depth * (self.bin_length / 2))[:, None] * self.direction
+        together = 0 if self.sheet is None else carry_along(self.sheet, self.raw_shift)
+        depth = self.raw_depth + together
+        return self.anchor + (depth * (self.bin_length / 2))[:, None] * self.direction
 
     def normal(self) -> Tensor:
         """``[M, 3]`` unit, towards the wall's side."""
@@ -184,8 +191,11 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def lift(self) -> None:
-        """Normals stay as they are, and stand for themselves from now on."""
+        """Places and normals stay as they are, and stand for themselves from now on."""
         self.raw_normal.copy_(self.normal())
+        self.anchor.copy_(self.centre())
+        for moved in (self.raw_depth, self.raw_shift):
+            moved.zero_()
         self.sheet = None
 
     def trust(self) -> Tensor:
@@ -202,13 +212,25 @@ class SurfelModel(nn.Module):
         return albedo_steps(self.albedo(), self.pairs)
 
     @torch.no_grad()
-    def update_visibility(self, opaque: float = 0.3, skip: float = 1.5, samples: int = 32) -> None:
-        """Find from which wall points each surfel's centre is hidden by the front sheet of the others.
+    def update_visibility(self) -> None:
+        """Find which surfels each spot sees, see :meth:`sees`."""
+        self.visible = self.sees(torch.arange(len(self.laser), device=self.laser.device), self.centre())
+
+    @torch.no_grad()
+    def sees(
+        self, spots: Tensor, places: Tensor, opaque: float = 0.3, skip: float = 1.5, samples: int = 32
+    ) -> Tensor:
+        """Which places the front sheet of the surfels leaves in view of laser and sensor.
 
         Args:
+            spots: ``[B]`` rows of the capture.
+            places: ``[V, 3]`` m.
             opaque: surfels of at least this share of the mean albedo hide.
-            skip: cells before the surfel that do not.
+            skip: cells before a place that do not.
             samples: along each line of sight.
+
+        Returns:
+            ``[B, V]`` bool.
         """
         albedo, centre = self.albedo(), self.centre()
         solid = albedo > opaque * albedo.mean()
@@ -221,11 +243,10 @@ class SurfelModel(nn.Module):
 
         def seen(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
-            return clear_view(sheet, origin, pitch, points, centre, samples, skip)[row]
+            return clear_view(sheet, origin, pitch, points, places, samples, skip)[row]
 
-        self.visible = seen(self.laser)
-        if not self.confocal:
-            self.visible &= seen(self.sensor)
+        clear = seen(self.laser[spots])
+        return clear if self.confocal else clear & seen(self.sensor[spots])
 
     def paths(self, spots: Tensor) -> Paths:
         """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
@@ -233,8 +254,30 @@ class SurfelModel(nn.Module):
         offsets = quadrature(self.quadrature, self.anchor.device)
         paths = trace(self.centre(), self.normal(), self.cell, offsets, *walls, self.confocal)
         if len(self.visible):
-            paths = paths._replace(contribution=paths.contribution * self.visible[spots][:, :, None])
+            paths = paths._replace(
+                contribution=paths.contribution * self.arriving(self.visible[spots])[:, :, None]
+            )
         return paths
+
+    def passing(self) -> Tensor:
+        """Share of the light that passes the sheets in front, whose outlines are known to a cell only."""
+        return torch.sigmoid(self.raw_passing)
+
+    @torch.no_grad()
+    def set_passing(self, share: float) -> None:
+        """Store the share that passes, from 0 to 1, in place; a fit leaves 0 and 1 as they are."""
+        self.raw_passing.copy_(torch.logit(torch.tensor(share)))
+
+    def arriving(self, visible: Tensor) -> Tensor:
+        """Share of the light that arrives: all where the view is clear, :meth:`passing` where it is not.
+
+        Args:
+            visible: ``[B, V]`` bool.
+
+        Returns:
+            ``[B, V]``.
+        """
+        return torch.where(visible, torch.ones_like(self.raw_passing), self.passing())
 
     def arrival(self, length: Tensor) -> Tensor:
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""

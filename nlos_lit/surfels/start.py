@@ -98,6 +98,7 @@ def seed_surfels(
         lateral=lateral,
         laser_sensor=sensor,
     )
+    model.set_passing(0.5)
     parts = s.subdivide or math.ceil(float(model.cell.max()) / (WIDEST * capture.bin_length))
     points = s.quadrature or points_along(float(model.cell.max()) / parts, capture.bin_length)
     step_bytes = len(model) * (parts * points) ** 2 * min(s.batch, len(train)) * BYTES_PER_PATH

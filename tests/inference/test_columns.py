@@ -106,6 +106,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
         changes.append(lambda mo, ex, h, d=direction: mo.raw_normal.copy_(normal + h * d))
     for name in ("sigma_ls", "kappa_s", "intensity", "background"):
         changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
+    changes.append(lambda mo, ex, h: mo.raw_passing.add_(h))
     for k, effect in enumerate(extension.effects):
         for p in effect.declared:
             changes.append(lambda mo, ex, h, k=k, p=p: getattr(ex.effects[k], f"raw_{p}").add_(h))
@@ -136,7 +137,7 @@ def test_smooth_tilts_lean_many_surfels_together():
     assert torch.allclose(fields.T @ fields / m, torch.eye(f), atol=1e-6)
     assert torch.equal(fields[:, 0], torch.ones(m))
     problem = build_problem(model, extension, spots, torch.zeros(4, 58))
-    lean = torch.zeros(2 * m + 2 * f + 4)
+    lean = torch.zeros(2 * m + 2 * f + 5)
     lean[2 * m : 2 * m + 2 * f] = 1 / TILT_PRIOR**2
     assert torch.allclose(problem.prior, lean)
     normal = model.normal().detach()

@@ -130,18 +130,18 @@ def test_a_plan_is_the_rounds_in_order():
 def test_seeds_stand_still_while_they_contest_and_faint_ones_go():
     fit = begun()
     fit.settings = dataclasses.replace(SETTINGS, albedo_rate=1e-6)
-    depths = fit.model.raw_depth.detach().clone()
+    places = fit.model.centre().detach().clone()
     with torch.no_grad():
         fit.model.raw_albedo[3] = -12.0  # softplus: 6e-6
         albedo = fit.model.albedo()
         left = int((albedo > 0.01 * torch.quantile(albedo, 0.99)).sum())
-    assert left < len(depths)
+    assert left < len(places)
     fit.begin_round()
     assert fit.plan[0].contest
     assert fit.model.quadrature == 1
     for _ in range(3):
         fit.step()
-    assert torch.equal(fit.model.raw_depth, depths)
+    assert torch.equal(fit.model.centre(), places)
     fit.end_round()
     assert len(fit.model) == left
     fit.begin_round()

@@ -268,6 +268,17 @@ def test_uneven_albedos_cost_by_their_ratio():
     assert more - double == pytest.approx(np.log(2) / 0.2, rel=0.1)  # nearly linear far out
 
 
+def test_a_share_passes_what_stands_in_front():
+    model, spots = random_model()
+    open_view = model.render(spots)
+    model.visible = torch.zeros(len(model.laser), len(model), dtype=torch.bool)
+    dark = model.render(spots)
+    assert torch.allclose(dark, model.laser_sensor.background().expand_as(dark), atol=1e-6)
+    model.set_passing(0.25)
+    assert torch.allclose(model.render(spots), dark + 0.25 * (open_view - dark), rtol=1e-4)
+    torch.autograd.grad(model.render(spots).sum(), model.raw_passing)
+
+
 def test_state_restores_the_model():
     model, spots = random_model()
     model.update_visibility()
