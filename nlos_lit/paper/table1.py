@@ -108,8 +108,10 @@ def _row(
     nmse = [p["heldout"]["nmse"] if refined else p["heldout"]["nmse"]["final"] for p in parts]
     geometry = [p["geometry"] for p in parts]
 
-    def mean(key: str, factor: float = 1.0) -> float:
-        return factor * float(np.mean([g[key] for g in geometry]))
+    def mean(key: str, factor: float = 1.0) -> float | None:
+        """None where one of them found nothing to compare."""
+        values = [g[key] for g in geometry]
+        return None if None in values else factor * float(np.mean(values))
 
     fitted = flags["albedo"]
     return {

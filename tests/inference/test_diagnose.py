@@ -26,7 +26,8 @@ SCENE = [
     "scene.volume.depth_pitch=0.0192",
 ]
 SMALL = [
-    "surfels.rounds=2", "surfels.steps=40", "criticism.spots=96", "criticism.steps=10", "criticism.rivals=1",
+    "surfels.contest=40", "surfels.rounds=2", "surfels.steps=40", "surfels.more=0",
+    "criticism.spots=96", "criticism.steps=10", "criticism.rivals=1",
     "criticism.finalists=1", "criticism.far_off=9", "criticism.most=1", "threads=1",
 ]  # fmt: skip
 FIGURES = [

@@ -66,6 +66,8 @@ def finished(tmp_path_factory) -> Path:
         "effects=[wall_reflectance,irf_tail]",
         "surfels.rounds=2",
         "surfels.steps=40",
+        "surfels.contest=20",
+        "surfels.more=0",
         folder=folder,
     )
     return folder
