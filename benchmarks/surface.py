@@ -81,7 +81,8 @@ def drawn(number: int) -> Case:
     lowest = float(np.nanmin(truth.depth))
     grid = volume_grid(capture, depth=(max(0.1, lowest - 0.15), lowest + 1.0))
     image = image_of(capture, grid, PipelineSettings(0.1))
-    return Case(f"drawn {number}", capture, grid, image, means, truth)
+    surface = SurfaceTruth(truth.x, truth.y, truth.depth, truth.normal, truth.albedo)
+    return Case(f"drawn {number}", capture, grid, image, means, surface)
 
 
 def known(name: str, data: str) -> Case:
