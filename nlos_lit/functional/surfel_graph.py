@@ -15,6 +15,8 @@ STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the pla
 BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
 STEP = 0.2  # of ln(albedo): smaller differences cost little
 FAINT = 0.03  # of the mean albedo
+LEVEL = 0.75  # quantile of the albedos that is taken for the scene's own level
+BRIGHT = 0.2  # deviation of ln(albedo) above that level
 
 
 def neighbour_pairs(
@@ -228,6 +230,29 @@ def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
     i, j = pairs
     level = torch.log(albedo + FAINT * albedo.detach().mean())
     return (torch.sqrt(((level[i] - level[j]) / STEP) ** 2 + 1) - 1).sum() / 2
+
+
+def brightness(albedo: Tensor) -> Tensor:
+    """Cost of albedos above the scene's own level: half a normal density of ln(albedo), of deviation BRIGHT.
+
+    Light that the model has no place for gathers on surfels that few spots see, many times brighter than
+    anything else.
+
+    Args:
+        albedo: ``[M]`` > 0.
+
+    Returns:
+        A scalar, differentiable in the albedos; the level itself is taken as it is.
+
+    Examples:
+        >>> import torch
+        >>> brightness(torch.tensor([0.1, 0.5, 0.5, 0.5]))
+        tensor(0.)
+        >>> round(brightness(torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5 * 2.71828**0.2])).item(), 3)
+        0.5
+    """
+    over = torch.log(albedo / torch.quantile(albedo.detach(), LEVEL)).clamp_min(0)
+    return ((over / BRIGHT) ** 2).sum() / 2
 
 
 def front_sheet(index: Tensor, depth: Tensor, limits: tuple[int, int]) -> Tensor:

@@ -49,6 +49,7 @@ class SurfelSettings:
         effect_rate: of physical effects, in their own noticeable steps.
         bending: weight of :meth:`SurfelModel.bending`; 1 takes it for the logarithm of a prior.
         evenness: weight of :meth:`SurfelModel.albedo_steps`.
+        brightness: weight of :meth:`SurfelModel.brightness`.
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
@@ -72,6 +73,7 @@ class SurfelSettings:
     effect_rate: float = 0.1
     bending: float = 0.5
     evenness: float = 0.5
+    brightness: float = 1.0
     surfel_cost: float = 1.5
     test_spots: int = 384
     visibility: bool = True
@@ -79,11 +81,11 @@ class SurfelSettings:
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
             raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
-        least = min(self.contest, self.bending, self.evenness, self.surfel_cost)
+        least = min(self.contest, self.bending, self.evenness, self.brightness, self.surfel_cost)
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
-                "surfels.floor must lie between 0 and 1, and surfels.contest, bending, evenness and "
-                f"surfel_cost be 0 or more; found floor={self.floor} and {least}"
+                "surfels.floor must lie between 0 and 1, and surfels.contest, bending, evenness, brightness "
+                f"and surfel_cost be 0 or more; found floor={self.floor} and {least}"
             )
 
 
@@ -444,7 +446,7 @@ class SurfelFit:
 
         Returns:
             ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``evenness``,
-            ``effects``.
+            ``brightness``, ``effects``.
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
@@ -453,6 +455,7 @@ class SurfelFit:
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
             "bending": s.bending * per_count * model.bending(),
             "evenness": s.evenness * per_count * model.albedo_steps(),
+            "brightness": s.brightness * per_count * model.brightness(),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
         return {"loss": sum(terms.values(), torch.zeros(())), **terms}

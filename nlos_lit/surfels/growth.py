@@ -333,20 +333,23 @@ LONE = 12.0  # nats, 5 standard deviations, that a surfel without a sheet must g
 
 
 @torch.no_grad()
-def support(model: SurfelModel) -> Tensor:
-    """Nats that neighbours speak for each surfel: one where a bright one lies in its plane, else less.
+def support(model: SurfelModel, worth: Tensor) -> Tensor:
+    """What neighbours are worth, as far as each surfel lies in one plane with them.
+
+    Surfels of a sheet share the counts' evidence: where they lie closer than the counts resolve, each by
+    itself is worth next to nothing, and all of them everything.
 
     Args:
         model: the surfels, linked.
+        worth: ``[M]`` nats that the counts lose without each.
 
     Returns:
-        ``[M]`` from 0 to 1.
+        ``[M]`` nats; a neighbour counts whole in the surfel's plane, not at all at a right angle.
     """
     i, j = model.pairs
     misfit = misfits(model.centre(), model.normal(), model.pairs)
     agree = 1 - torch.log1p(misfit / BEND**2) / math.log1p(1 / BEND**2)
-    none = torch.zeros(len(model), device=agree.device)
-    return none.scatter_reduce(0, i, model.trust()[j] * agree, "amax")
+    return torch.zeros_like(worth).index_add(0, i, worth[j] * agree)
 
 
 def dispersion(significance: Tensor) -> float:
@@ -407,8 +410,8 @@ def prune_and_grow(
 ) -> None:
     """Drop surfels that neither counts nor neighbours speak for; extend sheets; begin new ones.
 
-    A surfel stays while what the counts lose without it (``a² F/2``) and the :func:`support` of its
-    neighbours exceed ``cost``. A place that continues a sheet gets one where it gains more than
+    A surfel stays while what the counts lose without it (``a² F/2``) and without its neighbours in one
+    plane (:func:`support`) exceeds ``cost``. A place that continues a sheet gets one where it gains more than
     that. A place of the reserve, away from all sheets, must gain ``LONE`` nats, counted against the
     spread of all places' scores: a misfit that is not the surface's makes light seem to be missing
     everywhere.
@@ -447,8 +450,8 @@ def prune_and_grow(
     hidden = len(model.visible) > 0
     seen_now = model.arriving(model.visible[spots]) if hidden else None
     information = test(present, model.quadrature, seen_now)[1]
-    worth = albedo.double() ** 2 * information / 2 + support(model)
-    kept = (worth > cost) & inside(present.centre)
+    worth = albedo.double() ** 2 * information / 2
+    kept = (worth + support(model, worth) > cost) & inside(present.centre)
     if not kept.any():
         raise UserError(
             "every surfel faded away during the fit: the counts hold no third-bounce light at the image's "

@@ -16,6 +16,7 @@ from nlos_lit.functional.surfel_graph import (
     Sheet,
     albedo_steps,
     bending,
+    brightness,
     carry_along,
     clear_view,
     front_sheet,
@@ -210,6 +211,10 @@ class SurfelModel(nn.Module):
     def albedo_steps(self) -> Tensor:
         """How much albedos of neighbours differ, see the function of the same name."""
         return albedo_steps(self.albedo(), self.pairs)
+
+    def brightness(self) -> Tensor:
+        """How far albedos exceed the scene's own level, see the function of the same name."""
+        return brightness(self.albedo())
 
     @torch.no_grad()
     def update_visibility(self) -> None:

@@ -19,6 +19,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.surfel_graph import brightness
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.fit import SurfelSettings
@@ -331,11 +332,25 @@ def flat_sheet(capture: Capture, result, tilt: float = 0.0) -> SurfelModel:
     return model
 
 
-def test_neighbours_support_what_lies_in_their_plane(fitted):
+def test_neighbours_in_a_plane_share_their_worth(fitted):
     capture, result = fitted[0], fitted[-1]
-    assert torch.allclose(support(flat_sheet(capture, result)), torch.tensor(1 / 1.3))  # how bright they are
-    leaning = support(flat_sheet(capture, result, tilt=1.0))
-    assert leaning[4] < 0.6 / 1.3
+    worth = torch.arange(9.0)
+    flat = support(flat_sheet(capture, result), worth)
+    assert flat[4] == pytest.approx(36 - 4)  # all the others
+    assert flat[0] == pytest.approx(1 + 3 + 4)  # a corner has three neighbours
+    leaning = support(flat_sheet(capture, result, tilt=1.0), worth)
+    assert leaning[4] < 0.6 * flat[4]
+
+
+def test_what_outshines_the_scene_costs():
+    even = torch.full((8,), 0.3)
+    assert brightness(even) == 0
+    assert brightness(torch.cat([even, torch.full((4,), 0.01)])) == 0
+    outshone = torch.cat([even, torch.tensor([0.6])]).requires_grad_()
+    assert brightness(outshone).item() == pytest.approx(0.5 * (np.log(2) / 0.2) ** 2, rel=1e-5)
+    (slope,) = torch.autograd.grad(brightness(outshone), outshone)
+    assert slope[8] > 0
+    assert not slope[:8].any()
 
 
 def test_a_shift_takes_the_sheet_along(fitted):
