@@ -316,19 +316,19 @@ def clear_view(
     whole = target[:, 2].max() - front
     count = max(2, math.ceil(samples * float(((target[:, 2].max() - nearest) / whole).clamp(0, 1))))
     step = torch.arange(count, device=wall.device) / count
-    for part in range(0, len(wall), size := max(1, chunk // (len(target) * count))):
-        points = wall[part : part + size, None]
+    first = 0
+    for part in wall.split(max(1, chunk // (len(target) * count))):
+        points, rows = part[:, None], slice(first, first + len(part))
+        first = rows.stop
         d = target[None] - points
         start = ((nearest - points[..., 2]) / d[..., 2]).clamp(0, 1)[..., None]
         share = start + (1 - start) * step
         far = share < 1 - skip * pitch.abs().max() / torch.linalg.vector_norm(d, dim=2, keepdim=True)
-        cell = ((points[..., :2] - origin) / pitch + 1)[..., None] + share[:, :, None] * (d[..., :2] / pitch)[
-            ..., None
-        ]
-        cell = cell.round_()
+        begin, along = (points[..., :2] - origin) / pitch + 1, d[..., :2] / pitch
+        cell = (begin[..., None] + share[:, :, None] * along[..., None]).round_()
         i, j = cell[:, :, 0].clamp_(0, nx + 1), cell[:, :, 1].clamp_(0, ny + 1)
         height = flat[(i * (ny + 2) + j).long()]
         behind = points[..., 2:] + share * d[..., 2:] > height
         before = ~behind & torch.isfinite(height)
-        clear[part : part + size, late] = ~(before[..., :-1] & behind[..., 1:] & far[..., 1:]).any(2)
+        clear[rows, late] = ~(before[..., :-1] & behind[..., 1:] & far[..., 1:]).any(2)
     return clear

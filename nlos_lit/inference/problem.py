@@ -251,7 +251,7 @@ def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, 
 
     By albedos (in units of themselves), depths (in bins) and tilts.
     """
-    centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
+    centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
     unit = albedo_unit(albedo)
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)

@@ -25,7 +25,7 @@ from nlos_lit.surfels.model import SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
 WORTH = 0.05  # nats a parameter that another round must gain
-FAINTEST = 0.01  # of the bright albedo: seeds below it have lost the contest
+LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
 @dataclass(frozen=True)
@@ -382,11 +382,12 @@ class SurfelFit:
         return sum(each.steps for each in self.plan) - len(self.losses)
 
     def begin_round(self) -> None:
-        """What happens between rounds: shapes, death and growth, who hides whom; a new optimiser.
+        """What happens between rounds: neighbours, shapes, death and growth, who hides whom; a new optimiser.
 
         Normals follow the places of neighbours until the round ends.
         """
         s, now = self.settings, self.plan[0]
+        self.model.link()
         if now.shapes:
             choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
         if now.grow:
@@ -400,7 +401,6 @@ class SurfelFit:
         self.model.quadrature = (
             1 if now.contest else s.quadrature or points_along(widest, self.model.bin_length)
         )
-        self.model.link()
         self.model.lay()
         self.optimizer = self._new_optimizer()
 
@@ -482,11 +482,10 @@ class SurfelFit:
         self._set_rates(self.optimizer)
 
     def end_round(self) -> None:
-        """Note the round, link neighbours anew, and see whether another follows."""
+        """Note the round, and see whether another follows."""
         self.model.lift()
         if self.plan[0].contest:
             self._drop_faint()
-        self.model.link()
         sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
         loss = float(np.mean(self.losses[-len(self.losses) // 4 :]))
         passing = self.model.passing().item()
@@ -498,7 +497,7 @@ class SurfelFit:
     def _drop_faint(self) -> None:
         model = self.model
         albedo = model.albedo()
-        kept = albedo > FAINTEST * torch.quantile(albedo, 0.99)
+        kept = albedo > LOST * torch.quantile(albedo, 0.99)
         model.place(model.centre()[kept], model.normal()[kept], albedo[kept])
 
     def finish(self, progress: Progress | None = None) -> list[dict[str, float]]:

@@ -347,7 +347,7 @@ def support(model: SurfelModel, worth: Tensor) -> Tensor:
         ``[M]`` nats; a neighbour counts whole in the surfel's plane, not at all at a right angle.
     """
     i, j = model.pairs
-    misfit = misfits(model.centre(), model.normal(), model.pairs)
+    misfit = misfits(*model.placed(), model.pairs)
     agree = 1 - torch.log1p(misfit / BEND**2) / math.log1p(1 / BEND**2)
     return torch.zeros_like(worth).index_add(0, i, worth[j] * agree)
 
@@ -446,7 +446,7 @@ def prune_and_grow(
     def inside(places: Tensor) -> Tensor:
         return (places[:, 2] > low) & (places[:, 2] < high)
 
-    present, albedo = Seeds(model.centre(), model.normal()), model.albedo()
+    present, albedo = Seeds(*model.placed()), model.albedo()
     hidden = len(model.visible) > 0
     seen_now = model.arriving(model.visible[spots]) if hidden else None
     information = test(present, model.quadrature, seen_now)[1]

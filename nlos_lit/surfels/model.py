@@ -161,9 +161,14 @@ class SurfelModel(nn.Module):
 
     def normal(self) -> Tensor:
         """``[M, 3]`` unit, towards the wall's side."""
+        return self.placed()[1]
+
+    def placed(self) -> tuple[Tensor, Tensor]:
+        """:meth:`centre` and :meth:`normal`; on a sheet the second follows from the first."""
+        centre = self.centre()
         if self.sheet is not None:
-            return sheet_normals(self.sheet, self.centre())
-        return torch.nn.functional.normalize(self.raw_normal, dim=1)
+            return centre, sheet_normals(self.sheet, centre)
+        return centre, torch.nn.functional.normalize(self.raw_normal, dim=1)
 
     def albedo(self) -> Tensor:
         """``[M]`` ≥ 0, relative to the response's intensity."""
@@ -180,21 +185,22 @@ class SurfelModel(nn.Module):
     @torch.no_grad()
     def link(self) -> None:
         """Find each surfel's neighbours on its sheet."""
-        normal = self.normal()
+        centre, normal = self.placed()
         stretch = (1 / (-normal[:, 2]).clamp_min(STEEP)).clamp_max(2.0)
-        self.pairs = neighbour_pairs(self.centre(), normal, 1.6 * self.cell.max() * stretch)
+        self.pairs = neighbour_pairs(centre, normal, 1.6 * self.cell.max() * stretch)
 
     @torch.no_grad()
     def lay(self) -> None:
         """From now on normals follow from the places of neighbours, until :meth:`lift`."""
         self.lift()
-        self.sheet = lay_sheet(self.centre(), self.normal(), self.trust(), self.pairs, float(self.cell.max()))
+        self.sheet = lay_sheet(*self.placed(), self.trust(), self.pairs, float(self.cell.max()))
 
     @torch.no_grad()
     def lift(self) -> None:
         """Places and normals stay as they are, and stand for themselves from now on."""
-        self.raw_normal.copy_(self.normal())
-        self.anchor.copy_(self.centre())
+        centre, normal = self.placed()
+        self.raw_normal.copy_(normal)
+        self.anchor.copy_(centre)
         for moved in (self.raw_depth, self.raw_shift):
             moved.zero_()
         self.sheet = None
@@ -206,7 +212,7 @@ class SurfelModel(nn.Module):
 
     def bending(self) -> Tensor:
         """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`."""
-        return bending(self.centre(), self.normal(), self.trust(), self.pairs)
+        return bending(*self.placed(), self.trust(), self.pairs)
 
     def albedo_steps(self) -> Tensor:
         """How much albedos of neighbours differ, see the function of the same name."""
@@ -257,7 +263,7 @@ class SurfelModel(nn.Module):
         """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
-        paths = trace(self.centre(), self.normal(), self.cell, offsets, *walls, self.confocal)
+        paths = trace(*self.placed(), self.cell, offsets, *walls, self.confocal)
         if len(self.visible):
             paths = paths._replace(
                 contribution=paths.contribution * self.arriving(self.visible[spots])[:, :, None]
@@ -397,7 +403,7 @@ class SurfelModel(nn.Module):
 
     def points(self) -> Points:
         """Surfel centres with normals and albedo."""
-        arrays = (self.centre(), self.normal(), self.albedo())
+        arrays = (*self.placed(), self.albedo())
         return Points(*(a.detach().cpu().double().numpy() for a in arrays))
 
     def get_extra_state(self) -> dict[str, Any]:

@@ -23,7 +23,6 @@ QUICK = dataclasses.replace(SURFELS, contest=60, rounds=2, steps=120, more=0)
 NEARLY = 0.8  # share of the first one's predicted gain: whole diagnoses refit several rivals
 UNSEEN = {
     "wall_tilt": "a tilted wall and a turned scene are the same to second order",
-    "time_offset": "a scene that moves along z takes all but 0.02 % of it; tilts of the wall predict more",
     "higher_order_bounces": "late, weak surfels imitate them until a rebuild",
 }
 
