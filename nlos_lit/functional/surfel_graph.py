@@ -1,8 +1,7 @@
-"""How surfels hang together: neighbours on the same sheet, how well they fit one surface, who hides whom."""
+"""How surfels hang together: neighbours on the same sheet, and how well they fit one surface."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -253,82 +252,3 @@ def brightness(albedo: Tensor) -> Tensor:
     """
     over = torch.log(albedo / torch.quantile(albedo.detach(), LEVEL)).clamp_min(0)
     return ((over / BRIGHT) ** 2).sum() / 2
-
-
-def front_sheet(index: Tensor, depth: Tensor, limits: tuple[int, int]) -> Tensor:
-    """Depth of the nearest surfel of each lateral cell.
-
-    Args:
-        index: ``[M, 2]`` long, cell of each surfel; cells outside the limits are left out.
-        depth: ``[M]`` m.
-        limits: ``(nx, ny)`` numbers of cells.
-
-    Returns:
-        ``[nx, ny]`` m, infinite where there is none.
-
-    Examples:
-        >>> import torch
-        >>> front_sheet(torch.tensor([[0, 0], [0, 0], [0, 1]]), torch.tensor([2.0, 1.0, 3.0]), (1, 3))
-        tensor([[1., 3., inf]])
-    """
-    sheet = torch.full((limits[0] * limits[1],), torch.inf, dtype=depth.dtype, device=depth.device)
-    inside = ((index >= 0) & (index < torch.tensor(limits, device=index.device))).all(1)
-    key = index[inside, 0] * limits[1] + index[inside, 1]
-    return sheet.scatter_reduce(0, key, depth[inside], "amin").view(limits)
-
-
-def clear_view(
-    sheet: Tensor,
-    origin: Tensor,
-    pitch: Tensor,
-    wall: Tensor,
-    target: Tensor,
-    samples: int,
-    skip: float,
-    chunk: int = 1 << 18,
-) -> Tensor:
-    """Which straight lines from wall points to targets do not pierce the front sheet.
-
-    A line pierces the sheet where, between two samples in occupied cells, it goes from before it to behind
-    it; lines that pass behind a sheet's edge are clear. Lines are looked at from the sheet's nearest cell on.
-
-    Args:
-        sheet: ``[nx, ny]`` from :func:`front_sheet`, m.
-        origin: ``[2]`` x and y of the centre of cell (0, 0), m.
-        pitch: ``[2]`` signed spacing of cells, m.
-        wall: ``[W, 3]`` wall points, m.
-        target: ``[V, 3]`` m.
-        samples: looked at on a line all of which is beyond the nearest cell; fewer on others.
-        skip: within this many cells of the target nothing hides it.
-        chunk: samples worked on at once: what a processor's cache holds.
-
-    Returns:
-        ``[W, V]`` bool, True where the view is clear.
-    """
-    nx, ny = sheet.shape
-    clear = torch.ones(len(wall), len(target), dtype=torch.bool, device=wall.device)
-    nearest, front = sheet.min(), wall[:, 2].max()
-    late = torch.nonzero(target[:, 2] > nearest)[:, 0]
-    if not len(late) or not torch.isfinite(nearest):
-        return clear
-    target = target[late]
-    flat = torch.nn.functional.pad(sheet, (1, 1, 1, 1), value=torch.inf).reshape(-1)
-    whole = target[:, 2].max() - front
-    count = max(2, math.ceil(samples * float(((target[:, 2].max() - nearest) / whole).clamp(0, 1))))
-    step = torch.arange(count, device=wall.device) / count
-    first = 0
-    for part in wall.split(max(1, chunk // (len(target) * count))):
-        points, rows = part[:, None], slice(first, first + len(part))
-        first = rows.stop
-        d = target[None] - points
-        start = ((nearest - points[..., 2]) / d[..., 2]).clamp(0, 1)[..., None]
-        share = start + (1 - start) * step
-        far = share < 1 - skip * pitch.abs().max() / torch.linalg.vector_norm(d, dim=2, keepdim=True)
-        begin, along = (points[..., :2] - origin) / pitch + 1, d[..., :2] / pitch
-        cell = (begin[..., None] + share[:, :, None] * along[..., None]).round_()
-        i, j = cell[:, :, 0].clamp_(0, nx + 1), cell[:, :, 1].clamp_(0, ny + 1)
-        height = flat[(i * (ny + 2) + j).long()]
-        behind = points[..., 2:] + share * d[..., 2:] > height
-        before = ~behind & torch.isfinite(height)
-        clear[rows, late] = ~(before[..., :-1] & behind[..., 1:] & far[..., 1:]).any(2)
-    return clear

@@ -37,13 +37,16 @@ class SurfelSettings:
         significance: … whose Poisson score against the scan's mean transient exceeds this many standard
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
-        max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide.
+        max_seeds: the most significant are kept, and as many in reserve for growth; more surfels than that
+            are not divided.
+        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide, and
+            half as wide as often as the counts ask for it.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
             twice as many.
-        more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
+        more: last rounds that may follow, in some of which surfels are divided, see
+            :meth:`SurfelFit.schedule`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back. albedo_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
@@ -99,6 +102,7 @@ class Round:
         settling: it comes from seeds, and the response waits for their places.
         contest: surfels and response stand still; those that come out faint are left out afterwards.
         parts: into which each side of a surfel is divided before it.
+        trial: it is undone where it gains too little.
         grow: surfels die and grow before it.
         shapes: scanned parameters of effects start anew before it, where the counts ask for them.
     """
@@ -110,6 +114,7 @@ class Round:
     shapes: bool = False
     contest: bool = False
     parts: int = 1
+    trial: bool = False
 
 
 def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) -> list[Round]:
@@ -209,6 +214,7 @@ class SurfelFit:
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
         self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
+        self.undo: dict[str, Any] | None = None  # what a trial began with
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []
         self.optimizer: torch.optim.Optimizer | None = None
@@ -252,7 +258,7 @@ class SurfelFit:
 
     def state(self) -> dict[str, Any]:
         """A copy of all that changes while the fit goes on, as tensors, numbers and plain containers."""
-        names = ("order", "place", "tested", "done", "more", "before", "history", "losses")
+        names = ("order", "place", "tested", "done", "more", "before", "undo", "history", "losses")
         return copy.deepcopy(
             {name: getattr(self, name) for name in names}
             | {
@@ -282,7 +288,7 @@ class SurfelFit:
                 f"{sorted(own) or 'nothing'}; go on with the same effects, or begin anew"
             )
         device, state = self.counts.device, copy.deepcopy(state)
-        for name in ("order", "place", "tested", "done", "more", "before", "history", "losses"):
+        for name in ("order", "place", "tested", "done", "more", "before", "undo", "history", "losses"):
             setattr(self, name, state[name])
         self.model = SurfelModel.from_state(self.capture, state["model"])
         self.extension.load_state_dict(state["extension"])
@@ -339,27 +345,49 @@ class SurfelFit:
     def schedule(self, plan: Sequence[Round], more: int = 0) -> None:
         """Say what is to be done next; it takes the place of what was.
 
-        Last rounds are added while the fit is above the noise and gains more than ``WORTH`` a parameter.
-        Bright captures take longer to converge; where the fit is at the noise already, more batches would
-        only fit the noise.
+        Last rounds are added while the fit is above the noise and gains more than ``WORTH`` a parameter:
+        bright captures take longer to converge, and show finer detail. Every second of these rounds begins
+        with surfels divided in four, where what is unexplained could be worth that to so many parameters; it
+        is undone, and the last, where it turns out not to be. Where the fit is at the noise already, more
+        batches or finer surfels would only fit the noise.
 
         Args:
             plan: the rounds.
             more: last rounds that may be added, at most.
         """
         self.plan, self.more, self.before = list(plan), more, math.inf
+        self.undo = None
         self._add_round()
 
     def _add_round(self) -> None:
-        if self.plan or not self.more:
+        if self.plan or not (self.more or self.undo):
             return
         deviance, noise = self._deviance()
+        worth = 2 * WORTH / self.counts.numel()  # of a parameter, in deviance
+        gains = self.before - deviance >= worth * self._n_parameters()
+        tried, self.undo = self.undo, None
+        if tried is not None and not gains:
+            self._take_back(tried)
+            self.more = 0
+            return
+        s, added = self.settings, list[Round]()
+        divisible = tried is None and s.subdivide is None and len(self.model) <= s.max_seeds
+        new = 8 * len(self.model)  # a place and an albedo of four times as many surfels
+        if self.more and deviance > noise:
+            if divisible and deviance - noise >= worth * new:
+                added = [Round(s.steps, grow=True, parts=2, trial=True)]
+            elif gains:
+                added = rounds_of(s.steps, 1, settle=False, grow_first=True)
+        self.plan, self.more, self.before = added, self.more - 1 if added else 0, deviance
+
+    def _n_parameters(self) -> int:
         others = [*self.model.laser_sensor.parameters(), *self.extension.parameters()]
-        parameters = 2 * len(self.model) + sum(p.numel() for p in others)  # a place and an albedo each
-        gained = (self.before - deviance) * self.counts.numel() / 2
-        if deviance > noise and gained >= WORTH * parameters:
-            self.plan = rounds_of(self.settings.steps, 1, settle=False, grow_first=True)
-        self.more, self.before = self.more - 1 if self.plan else 0, deviance
+        return 2 * len(self.model) + sum(p.numel() for p in others)  # a place and an albedo each
+
+    def _take_back(self, undo: dict[str, Any]) -> None:
+        """Surfels, response and effects as they were before a trial."""
+        self.model = SurfelModel.from_state(self.capture, undo["model"]).to(self.counts.device)
+        self.extension.load_state_dict(undo["extension"])
 
     @property
     def finished(self) -> bool:
@@ -387,6 +415,9 @@ class SurfelFit:
         Normals follow the places of neighbours until the round ends.
         """
         s, now = self.settings, self.plan[0]
+        if now.trial:
+            model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
+            self.undo = copy.deepcopy({"model": model, "extension": extension})
         self.model.link()
         if now.shapes:
             choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
@@ -542,15 +573,6 @@ class SurfelFit:
         """
         self.schedule(rounds_of(steps or self.settings.steps, rounds, settle, grow_first))
         return self.finish(progress)
-
-    def converge(self) -> list[dict[str, float]]:
-        """Last rounds anew while they gain, see :meth:`schedule`.
-
-        Returns:
-            one entry a round, ``settings.more`` at most.
-        """
-        self.schedule([], self.settings.more)
-        return self.finish()
 
     @torch.no_grad()
     def _deviance(self) -> tuple[float, float]:

@@ -18,8 +18,6 @@ from nlos_lit.functional.surfel_graph import (
     bending,
     brightness,
     carry_along,
-    clear_view,
-    front_sheet,
     lay_sheet,
     neighbour_pairs,
     sheet_normals,
@@ -33,13 +31,16 @@ from nlos_lit.functional.surfel_paths import (
     spread,
     trace,
 )
+from nlos_lit.functional.surfel_visibility import clear_view
 from nlos_lit.io.points import Points
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
+OPAQUE = 0.6  # of the mean albedo: fainter surfels may be false, and hide nothing
+
 
 class Lateral(NamedTuple):
-    """The lattice of lateral cells on which the front sheet is kept for the visibility test."""
+    """The lattice of lateral cells from which surfels begin, and on which pictures show them."""
 
     origin: tuple[float, float]  # centre of cell [0, 0], m
     pitch: tuple[float, float]  # signed, m
@@ -228,33 +229,22 @@ class SurfelModel(nn.Module):
         self.visible = self.sees(torch.arange(len(self.laser), device=self.laser.device), self.centre())
 
     @torch.no_grad()
-    def sees(
-        self, spots: Tensor, places: Tensor, opaque: float = 0.3, skip: float = 1.5, samples: int = 32
-    ) -> Tensor:
-        """Which places the front sheet of the surfels leaves in view of laser and sensor.
+    def sees(self, spots: Tensor, places: Tensor) -> Tensor:
+        """Which places the surfels leave in view of laser and sensor; those below ``OPAQUE`` hide nothing.
 
         Args:
             spots: ``[B]`` rows of the capture.
             places: ``[V, 3]`` m.
-            opaque: surfels of at least this share of the mean albedo hide.
-            skip: cells before a place that do not.
-            samples: along each line of sight.
 
         Returns:
             ``[B, V]`` bool.
         """
-        albedo, centre = self.albedo(), self.centre()
-        solid = albedo > opaque * albedo.mean()
-        cells = self.lateral
-        origin, pitch = (
-            torch.tensor(v, dtype=torch.float32, device=centre.device) for v in (cells.origin, cells.pitch)
-        )
-        index = ((centre[solid, :2] - origin) / pitch).round().long()
-        sheet = front_sheet(index, centre[solid, 2], cells.shape)
+        albedo, (centre, normal) = self.albedo(), self.placed()
+        solid = albedo > OPAQUE * albedo.mean()
 
         def seen(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
-            return clear_view(sheet, origin, pitch, points, places, samples, skip)[row]
+            return clear_view(centre[solid], normal[solid], self.cell, points, places)[row]
 
         clear = seen(self.laser[spots])
         return clear if self.confocal else clear & seen(self.sensor[spots])

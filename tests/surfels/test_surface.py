@@ -22,7 +22,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import brightness
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
-from nlos_lit.surfels.fit import SurfelSettings
+from nlos_lit.surfels.fit import Round, SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels, score_spots
 from nlos_lit.surfels.growth import (
     Score,
@@ -137,20 +137,45 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
 def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
     capture, held, intensity, grid, _ = fitted
     train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, contest=0, rounds=1, steps=20)
-    seen, deviances, rounds = [], [], []
+    seen, deviances, results = [], [], []
     for more in (0, 1, 6):
         settings = dataclasses.replace(short, more=more)
         progress = (lambda *count: seen.append(count)) if more == 1 else None
         result = fit_surfels(capture, intensity, grid, settings, train, progress=progress)
         deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
-        rounds.append(len(result.history))
+        results.append(result)
+    rounds = [len(result.history) for result in results]
     assert rounds[:2] == [1, 2]
     assert 3 <= rounds[2] <= 7
     assert deviances[0] > deviances[1] > deviances[2]
-    assert seen == [(k, 40) for k in range(1, 41)] + [(k, 80) for k in range(41, 81)]
-    own = result.fit.copy(Extension([]), 0)
+    # Cells are coarse here: the first round more begins with surfels divided in four.
+    assert seen == [(k, 40) for k in range(1, 41)] + [(k, 60) for k in range(41, 61)]
+    cells = [float(result.model.cell[0]) for result in results]
+    assert cells[1] == pytest.approx(cells[0] / 2)
+    own = results[-1].fit.copy(Extension([]), 0)
     own.counts = own.model.expected(own.train)
-    assert own.converge() == []
+    own.schedule([], 4)
+    assert own.finished
+
+
+def test_surfels_are_not_divided_where_that_is_not_worth_it(fitted):
+    fit = fitted[-1].fit.copy(Extension([]), 0)
+    fit.counts = torch.poisson(fit.model.expected(fit.train), generator=torch.Generator().manual_seed(1))
+    fit.settings = dataclasses.replace(QUICK, steps=20, albedo_rate=0.0, depth_rate=0.0, response_rate=0.0)
+    every_other = torch.arange(len(fit.train)) % 2
+    fit.counts = fit.counts * (0.7 + 0.6 * every_other)[:, None]  # no surface does that
+    before = {name: value.clone() for name, value in fit.model.state_dict().items() if torch.is_tensor(value)}
+    fit.schedule([], 4)
+    assert fit.plan == [Round(20, grow=True, parts=2, trial=True)]
+    fit.finish()
+    assert [entry["surfels"] > 3 * len(fit.model) for entry in fit.history] == [True]
+    after = fit.model.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    for change in ({"subdivide": 1}, {"max_seeds": len(fit.model) - 1}):
+        other = fit.copy(Extension([]), 0)
+        other.settings = dataclasses.replace(fit.settings, **change)
+        other.schedule([], 1)
+        assert [each.parts for each in other.plan] == [1]
 
 
 def test_only_the_given_spots_are_scored(fitted):

@@ -17,8 +17,6 @@ from nlos_lit.functional.surfel_graph import (
     STIFFNESS,
     albedo_steps,
     bending,
-    clear_view,
-    front_sheet,
     misfits,
     neighbour_pairs,
 )
@@ -221,18 +219,6 @@ def test_a_batch_is_its_spots_one_by_one():
     model, spots = random_model()
     single = torch.cat([model.render(s[None]) for s in spots])
     assert torch.allclose(model.expected(spots), single, rtol=1e-5, atol=1e-6)
-
-
-def test_front_sheet_hides_what_lies_behind_it_but_not_beside_it():
-    # A row of cells x = 0 … 4 at z = 0.5; targets behind its middle and beyond its edge.
-    index = torch.tensor([[i, j] for i in range(5) for j in range(3)])
-    sheet = front_sheet(index, torch.full((15,), 0.5), (12, 3))
-    origin, pitch = torch.tensor([0.0, 0.0]), torch.tensor([0.1, 0.1])
-    spots = torch.tensor([[0.2, 0.1, 0.0], [1.0, 0.1, 0.0]])
-    targets = torch.tensor([[0.2, 0.1, 1.0], [0.9, 0.1, 1.0]])
-    clear = clear_view(sheet, origin, pitch, spots, targets, samples=40, skip=0.0)
-    # From (1.0, 0.1) the first target is seen past the edge: at z = 0.5 the line is at x = 0.6.
-    assert clear.tolist() == [[False, True], [True, True]]
 
 
 def test_bending_vanishes_on_a_sphere_and_punishes_turned_normals():

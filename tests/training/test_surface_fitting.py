@@ -234,7 +234,7 @@ def test_the_door_leaves_a_surface(finished):
     refined, heldout = summary["refined"], summary["heldout"]
     assert heldout["nmse"]["final"] < heldout["nmse"]["initial"]
     assert refined["heldout"]["nmse"] == pytest.approx(heldout["nmse"]["final"], rel=1e-3)
-    assert summary["iterations"] == 4 + 8 + 16 + 16
+    assert summary["iterations"] == 4 + 8 + 16 + 8
     assert {"sigma_ls", "irf_tail.fraction", "wall_reflectance.rms"} <= set(summary["parameters"])
     place = finished / "refined"
     assert {path.name for path in place.iterdir()} >= {
@@ -257,7 +257,7 @@ def test_events_hold_the_way_of_the_surface(finished):
         "loss/total", "loss/counts", "loss/bending", "deviance", "surfels", "heldout/deviance_per_bin",
         "parameters/sigma_ls", "parameters/irf_tail.fraction",
     } <= set(tags["scalars"])  # fmt: skip
-    assert len(events.Scalars("deviance")) == 44
+    assert len(events.Scalars("deviance")) == 36
     assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
     assert {"overview", "surface", "transients", "laser_sensor"} <= set(tags["images"])
     assert len(events.Images("overview")) == 4  # at the start, after 20 and 40, at the end
