@@ -3,15 +3,18 @@
     python benchmarks/surface.py draw=0,1,2 seeds=3            # effect-free scenes of curved bodies
     python benchmarks/surface.py known=bunny,z data=DIR        # simulated and rendered, with the true surface
     python benchmarks/surface.py scene=su path=FILE seeds=3 effects=wall_reflectance,irf_tail
+    python benchmarks/surface.py draw=1,2,9 surfels.bending=1 constant.surfels.model.OPAQUE=0.3
 
-Prints one JSON line a fit. For drawn scenes the noise is the deviance of the same counts under the true
-expectation; otherwise that of counts drawn from the fit. ``pictures=DIR`` also leaves an overview of each
-fit. One thread.
+Settings of the fit and constants of ``nlos_lit`` can be changed, to see how much hangs on them. Prints one
+JSON line a fit. For drawn scenes the noise is the deviance of the same counts under the true expectation;
+otherwise that of counts drawn from the fit. ``pictures=DIR`` also leaves an overview of each fit. One thread.
 """
 
 from __future__ import annotations
 
+import ast
 import dataclasses
+import importlib
 import json
 import sys
 import time
@@ -140,8 +143,25 @@ def of_letters(found: FittedSurfels, case: Case) -> dict[str, float]:
     }
 
 
+def changed(options: dict[str, str]) -> SurfelSettings:
+    """Settings by ``surfels.NAME=VALUE``; constants by ``constant.MODULE.NAME=VALUE`` are set in place."""
+    own = {
+        name.removeprefix("surfels."): ast.literal_eval(value)
+        for name, value in options.items()
+        if name.startswith("surfels.")
+    }
+    for name, value in options.items():
+        if name.startswith("constant."):
+            module, constant = name.removeprefix("constant.").rsplit(".", 1)
+            place = importlib.import_module(f"nlos_lit.{module}")
+            getattr(place, constant)  # one that is there
+            setattr(place, constant, ast.literal_eval(value))
+    return SurfelSettings(**own)
+
+
 def fit_rows(case: Case, options: dict[str, str]) -> None:
     """One line a seed."""
+    settings = changed(options)
     capture = case.capture
     block = 8 if capture.n_spots >= 4096 else 4
     mask, lit = heldout_mask(capture, block, 4), capture.gated_counts().any(1)
@@ -154,7 +174,7 @@ def fit_rows(case: Case, options: dict[str, str]) -> None:
             capture,
             case.image,
             case.grid,
-            SurfelSettings(),
+            settings,
             train,
             extension=extension,
             seed=seed,
@@ -170,6 +190,7 @@ def fit_rows(case: Case, options: dict[str, str]) -> None:
         row = {
             "scene": case.name,
             "seed": seed,
+            "changed": {name: v for name, v in options.items() if "." in name},
             "over_noise": scores.deviance_per_bin / noise,
             **dataclasses.asdict(scores),
             "surfels": len(found.model),

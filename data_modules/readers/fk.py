@@ -45,7 +45,8 @@ def matches(contents: Contents) -> bool:
 def read(path: Path, options: ReaderOptions) -> Capture:
     """A cube ``meas`` as a capture, each spot's delay taken off by whole bins.
 
-    ``tofgrid`` (ps) is each spot's time from laser to wall to detector.
+    ``tofgrid`` (ps) is each spot's time from laser to wall to detector. Files that other programs than MATLAB
+    wrote have their axes the other way round; there the first axis is the longest one, and holds the bins.
 
     Args:
         path: of the file.
@@ -66,9 +67,12 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     width = options.bin_width_ps or BIN_WIDTH_PS
     sides = options.wall_sides or (WALL_SIZE, WALL_SIZE)
     data = contents.counts("meas")
+    steps = [f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m"]
+    if len(data) > max(data.shape[1:]):  # not written by MATLAB, which turns the order of axes round
+        data = data.transpose(2, 1, 0)
+        steps.append(f"time is the longest axis of meas: {list(data.shape)}")
     rows, columns, bins = data.shape
     counts = data.reshape(rows * columns, bins)
-    steps = [f"bins of {width:g} ps, wall {sides[0]:g} m × {sides[1]:g} m"]
     t_start = 0.0
     delays = _delays(contents, (rows, columns))
     if delays is None:

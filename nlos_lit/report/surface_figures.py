@@ -71,14 +71,15 @@ def overview(
         title: of the figure.
 
     Returns:
-        a figure of five panels to one scale; the depth's and the residuals' colours span 98 % of them.
+        a figure of five panels to one scale; colours of albedo, depth and residuals span 98 % of them.
     """
     figure = Figure(figsize=(16, 3.4))
     panels = figure.subplots(1, 5, sharex=True, sharey=True)
     ends = _ends(front.x, front.y)
     colour_bar(lattice_image(panels[0], image.values, *_ends(image.x, image.y), cmap=INTENSITY, vmin=0), "")
-    colour_bar(lattice_image(panels[1], front.albedo, *ends, cmap="cividis", vmin=0), "")
-    seen = front.depth[np.isfinite(front.depth)]
+    albedo, seen = (values[np.isfinite(values)] for values in (front.albedo, front.depth))
+    brightest = float(np.quantile(albedo, 0.98)) if len(albedo) else 1.0
+    colour_bar(lattice_image(panels[1], front.albedo, *ends, cmap="cividis", vmin=0, vmax=brightest), "")
     scale: dict[str, Any] = {"norm": Normalize(*np.quantile(seen, (0.01, 0.99)))} if len(seen) else {}
     colour_bar(lattice_image(panels[2], front.depth, *ends, cmap=DEPTH, **scale), "")
     lattice_image(panels[3], _normal_colours(front.normals), *ends)

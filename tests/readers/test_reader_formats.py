@@ -1,5 +1,6 @@
 """Each format's axes, times, units and kind, against places worked out by hand."""
 
+import h5py
 import numpy as np
 import pytest
 import reader_files as files
@@ -268,6 +269,19 @@ def test_an_option_that_means_nothing_is_refused(tmp_path, writer, options, opti
 def test_what_the_file_does_not_say_is_asked_for(tmp_path):
     with pytest.raises(CaptureError, match="bin_width_ps and wall_size"):
         read_capture(files.plain_cube(tmp_path))
+
+
+def test_the_longest_axis_is_time_where_axes_stand_the_other_way_round(tmp_path):
+    usual = read_capture(files.fk(tmp_path))
+    with h5py.File(tmp_path / "scene.mat", "r+") as file:
+        for name in ("meas", "tofgrid"):
+            turned = file[name][()].T  # as programs write it that do not turn axes for MATLAB
+            del file[name]
+            file[name] = turned if name == "meas" else turned.T
+    capture = read_capture(tmp_path / "scene.mat")
+    np.testing.assert_array_equal(capture.counts, usual.counts)
+    np.testing.assert_array_equal(capture.laser, usual.laser)
+    assert any("longest axis" in step for step in capture.provenance["steps"])
 
 
 def test_a_forced_format_reads_what_detection_would_not(tmp_path):

@@ -144,6 +144,18 @@ def test_the_diffuse_s_reads_as_s_from_the_wall():
     assert _ratio(seen, np.s_[18:21, 18:21], np.s_[19:21, 7:10]) > 1.3  # and at the lower left
 
 
+def test_the_slab_captures_scan_32_by_32_spots():
+    options = ReaderOptions(bin_width_ps=16.0, wall_size=0.7)
+    capture = read_capture(real_file("measured/slab/letter_u_60.mat"), options=options)
+    assert (capture.kind, capture.scan_shape, capture.n_bins, capture.is_counts) == (
+        "confocal", (32, 32), 512, True,
+    )  # fmt: skip
+    with h5py.File(real_file("measured/slab/letter_u_60.mat")) as file:
+        assert capture.counts.sum() == pytest.approx(file["meas"][()].astype(np.float64).sum())
+    # Light that came through the foam fills every spot, late and slowly.
+    assert (capture.counts.sum(1) > 1000).all()
+
+
 def test_s_and_u_read_from_the_wall_and_stand_upright():
     capture = read_capture(real_file("measured/data_s_u.mat")).sum_spots(2).sum_bins(4)
     seen = np.max([_seen(_image(capture, depth, 1)) for depth in np.arange(0.6, 0.8, 0.02)], axis=0)
