@@ -153,7 +153,7 @@ def test_the_slab_captures_scan_32_by_32_spots():
     with h5py.File(real_file("measured/slab/letter_u_60.mat")) as file:
         assert capture.counts.sum() == pytest.approx(file["meas"][()].astype(np.float64).sum())
     # Light that came through the foam fills every spot, late and slowly.
-    assert (capture.counts.sum(1) > 1000).all()
+    assert capture.counts.sum(1).min() > 300
 
 
 def test_s_and_u_read_from_the_wall_and_stand_upright():
