@@ -37,10 +37,10 @@ class SurfelSettings:
         significance: … whose Poisson score against the scan's mean transient exceeds this many standard
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
-        max_seeds: the most significant are kept, and as many in reserve for growth; more surfels than that
-            are not divided.
+        max_seeds: the most significant are kept, and as many in reserve for growth.
         subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide, and
-            half as wide as often as the counts ask for it.
+            half as wide as often as the counts ask for it …
+        most: … and division leaves no more surfels than this.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
         rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
@@ -64,6 +64,7 @@ class SurfelSettings:
     per_cell: int = 3
     max_seeds: int = 3000
     subdivide: int | None = None
+    most: int = 12000
     quadrature: int | None = None
     contest: int = 150
     rounds: int = 5
@@ -371,7 +372,7 @@ class SurfelFit:
             self.more = 0
             return
         s, added = self.settings, list[Round]()
-        divisible = tried is None and s.subdivide is None and len(self.model) <= s.max_seeds
+        divisible = tried is None and s.subdivide is None and 4 * len(self.model) <= s.most
         new = 8 * len(self.model)  # a place and an albedo of four times as many surfels
         if self.more and deviance > noise:
             if divisible and deviance - noise >= worth * new:

@@ -171,7 +171,7 @@ def test_surfels_are_not_divided_where_that_is_not_worth_it(fitted):
     assert [entry["surfels"] > 3 * len(fit.model) for entry in fit.history] == [True]
     after = fit.model.state_dict()
     assert all(torch.equal(after[name], value) for name, value in before.items())
-    for change in ({"subdivide": 1}, {"max_seeds": len(fit.model) - 1}):
+    for change in ({"subdivide": 1}, {"most": 4 * len(fit.model) - 1}):
         other = fit.copy(Extension([]), 0)
         other.settings = dataclasses.replace(fit.settings, **change)
         other.schedule([], 1)
