@@ -104,6 +104,7 @@ class SurfaceFitting(CaptureFit):
         fit.stepped(terms)
         if fit.round_done:
             fit.end_round()
+            self.model = fit.model  # another one where a round was undone
             self.trainer.should_stop = fit.finished
         counts = fit.counts[rows]
         least = (counts - torch.xlogy(counts, counts)).mean()  # the same term where every bin is met exactly

@@ -56,10 +56,16 @@ def same(first: object, second: object) -> bool:
 
 
 def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_path):
-    straight, stopped, moments = begun(), begun(), 0
-    straight.finish()
+    straight, stopped, moments, tried = begun(), begun(), 0, []
+    while not straight.finished:
+        straight.begin_round()
+        tried += straight.state()["plan"]
+        while not straight.round_done:
+            straight.step()
+        straight.end_round()
     assert straight.history[0]["surfels"] <= 12
-    assert len(straight.history) > 2  # rounds were added
+    assert len(straight.history) > 3  # rounds were added
+    assert any(trial for *_, trial in tried), "no surfels were divided on trial"
     while not stopped.finished:
         stopped = through_a_file(stopped, tmp_path / "state.pt")
         if not stopped.in_round:
