@@ -179,8 +179,8 @@ def _nothing(diagnosis: Diagnosis) -> str:
     if not excess > AT_NOISE:
         return "Nothing in the registry is needed: the fit is at the noise."
     return (
-        f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise,"
-        " is not significant."
+        f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise, has no"
+        " clear shape along time, wall, scan or count rate; the fitted surface itself may be incomplete."
     )
 
 
