@@ -25,8 +25,8 @@ def clear_view(
 ) -> Tensor:
     """Which straight lines from wall points to targets do not pierce a patch.
 
-    Outlines are known to a pixel: 0.4 of a cell for the nearest patches, one cell for those 2.5 times farther
-    away.
+    What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel: 0.4 of a
+    cell for the nearest patches, one cell for those 2.5 times farther away.
 
     Args:
         centre: ``[M, 3]`` m, of the patches that hide.
@@ -34,7 +34,7 @@ def clear_view(
         cell: ``[2]`` lateral extents of a patch, m.
         wall: ``[W, 3]`` wall points, m.
         target: ``[V, 3]`` m.
-        chunk: points worked on at once, bounds the memory.
+        chunk: points and pixels worked on at once, bounds the memory.
 
     Returns:
         ``[W, V]`` bool, True where the view is clear.
@@ -49,17 +49,24 @@ def clear_view(
                 [ True]])
     """
     clear = torch.ones(len(wall), len(target), dtype=torch.bool, device=wall.device)
-    if not len(centre) or not len(target):
+    if not len(centre):
         return clear
     shift, _ = spread(normal, cell, quadrature(DRAWN, cell.device))
     drawn = (centre[:, None] + shift).reshape(-1, 3)
     patch = torch.arange(len(centre), device=wall.device).repeat_interleave(DRAWN**2)
     side, front = cell.max(), wall[:, 2].max()
     nearest = (torch.quantile(centre[:, 2], NEAR) - front).clamp_min(side)
+    behind = torch.nonzero(target[:, 2] - front > nearest)[:, 0]
+    if not len(behind):
+        return clear
+    target = target[behind]
     pixel = PIXEL * side / nearest
     level = (normal * centre).sum(1)  # of each patch's plane
+    # No line of sight leaves the box around wall and targets: at most so many pixels across.
+    across = torch.cat([wall[:, :2], target[:, :2]])
+    pixels = int(((across.amax(0) - across.amin(0)) / (PIXEL * side) + 3).prod())
     first = 0
-    for part in wall.split(max(1, chunk // (len(drawn) + len(target)))):
+    for part in wall.split(max(1, chunk // (len(drawn) + len(target) + pixels))):
         rows = slice(first, first + len(part))
         first = rows.stop
         (u, v, z), (tu, tv, tz) = _seen_from(part, drawn, pixel), _seen_from(part, target, pixel)
@@ -77,7 +84,7 @@ def clear_view(
         plane = level[hider]
         own = (n * target).sum(2) - plane
         eye = (n * part[:, None]).sum(2) - plane
-        clear[rows] = ~(at_front & (own * eye < 0) & (own.abs() > CLEAR * side))
+        clear[rows, behind] = ~(at_front & (own * eye < 0) & (own.abs() > CLEAR * side))
     return clear
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 from data_modules.simulate.bodies import Plate, Torus, assemble
 from data_modules.simulate.visibility import Occluder
@@ -101,6 +102,25 @@ def test_errors_of_outlines_on_a_ring_before_a_board():
     wrong = float((facing & (found != true)).sum() / facing.sum())
     assert hidden > 0.1
     assert wrong < 0.03
+
+
+def test_strays_at_the_wall_take_no_memory():
+    sheet, stray = lattice((-5, 6), (-5, 6), 0.8), lattice((4, 5), (0, 1), 0.02)
+    both = tuple(torch.cat(parts) for parts in zip(sheet, stray, strict=True))
+    wall = torch.cat([torch.rand(500, 2), torch.zeros(500, 1)], 1)
+    cell, behind = CELL / 20, torch.cat([both[0], torch.tensor([[0.0, 0.0, 1.2]])])
+    pictures: list[int] = []
+
+    class Watch(TorchFunctionMode):
+        def __torch_function__(self, func, types, args=(), kwargs=None):
+            result = func(*args, **(kwargs or {}))
+            pictures.append(result.numel() if torch.is_tensor(result) else 0)
+            return result
+
+    with Watch():
+        clear = clear_view(*both, cell, wall, behind)
+    assert clear[:, 121].all()  # the stray itself
+    assert max(pictures) <= 1 << 19
 
 
 def test_the_size_of_a_batch_changes_nothing():
