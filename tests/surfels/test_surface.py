@@ -22,7 +22,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import brightness
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
-from nlos_lit.surfels.fit import Round, SurfelSettings
+from nlos_lit.surfels.fit import WORTH, Round, SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels, score_spots
 from nlos_lit.surfels.growth import (
     Score,
@@ -176,6 +176,35 @@ def test_surfels_are_not_divided_where_that_is_not_worth_it(fitted):
         other.settings = dataclasses.replace(fit.settings, **change)
         other.schedule([], 1)
         assert [each.parts for each in other.plan] == [1]
+
+
+@pytest.mark.parametrize(("excess", "parts"), [(0.9, 1), (1.1, 2)])
+def test_what_is_unexplained_must_be_worth_the_new_parameters_before_surfels_are_divided(
+    fitted, monkeypatch, excess, parts
+):
+    fit = fitted[-1].fit.copy(Extension([]), 0)
+    left = excess * WORTH * 8 * len(fit.model) * 2 / fit.counts.numel()
+    monkeypatch.setattr(fit, "_deviance", lambda: (0.7 + left, 0.7))
+    fit.schedule([], 1)
+    assert [each.parts for each in fit.plan] == [parts]
+
+
+@pytest.mark.parametrize(("gain", "stays"), [(0.9, False), (1.1, True)])
+def test_divided_surfels_stay_where_they_gain_what_parameters_must(fitted, monkeypatch, gain, stays):
+    fit = fitted[-1].fit.copy(Extension([]), 0)
+    fit.settings = dataclasses.replace(QUICK, steps=1)
+    monkeypatch.setattr(fit, "_deviance", lambda: (1.0, 0.7))
+    fit.schedule([], 1)
+    few = len(fit.model)
+
+    def after() -> tuple[float, float]:
+        sensor = sum(p.numel() for p in fit.model.laser_sensor.parameters())
+        return 1 - gain * WORTH * (2 * len(fit.model) + sensor) * 2 / fit.counts.numel(), 0.7
+
+    monkeypatch.setattr(fit, "_deviance", after)
+    fit.finish()
+    assert (len(fit.model) > 2 * few) == stays
+    assert stays or len(fit.model) == few
 
 
 def test_only_the_given_spots_are_scored(fitted):

@@ -22,7 +22,7 @@ from nlos_lit.functional.surfel_graph import (
 )
 from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels.model import OPAQUE, Lateral, SurfelModel, spline_sensor
 
 CELL = 0.05
 FACING = [0.0, 0.0, -1.0]
@@ -252,6 +252,17 @@ def test_uneven_albedos_cost_by_their_ratio():
         np.sqrt((np.log(2) / 0.2) ** 2 + 1) - 1, rel=0.05
     )  # FAINT moves it a little
     assert more - double == pytest.approx(np.log(2) / 0.2, rel=0.1)  # nearly linear far out
+
+
+@pytest.mark.parametrize(("share", "hides"), [(0.95, False), (1.05, True)])
+def test_faint_surfels_hide_nothing(share, hides):
+    capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    others = [[x, 0.5, 0.5] for x in (-0.4, 0.4)]
+    # Its own albedo is part of the mean, too: a = share · OPAQUE · (3 + a)/4.
+    albedo = 3 * share * OPAQUE / (4 - share * OPAQUE)
+    model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], *others], albedo=[albedo, 1.0, 1.0, 1.0])
+    model.update_visibility()
+    assert model.visible.tolist() == [[True, not hides, True, True]]
 
 
 def test_a_share_passes_what_stands_in_front():
