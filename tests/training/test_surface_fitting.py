@@ -260,7 +260,7 @@ def test_events_hold_the_way_of_the_surface(finished):
     assert len(events.Scalars("deviance")) == 36
     assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
     assert {"overview", "surface", "transients", "laser_sensor"} <= set(tags["images"])
-    assert len(events.Images("overview")) == 4  # at the start, after 20 and 40, at the end
+    assert len(events.Images("overview")) == 3  # at the start, after 20, at the end
 
 
 CTRL_C = """
