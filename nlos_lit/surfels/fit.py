@@ -387,8 +387,9 @@ class SurfelFit:
 
     def _take_back(self, undo: dict[str, Any]) -> None:
         """Surfels, response and effects as they were before a trial."""
-        self.model = SurfelModel.from_state(self.capture, undo["model"]).to(self.counts.device)
+        self.model = SurfelModel.from_state(self.capture, undo["model"])
         self.extension.load_state_dict(undo["extension"])
+        self.to(self.counts.device)
 
     @property
     def finished(self) -> bool:
