@@ -141,7 +141,8 @@ class EffectContract:
             assert (p.null is None) == bool(p.grid)
             assert p.lower <= (p.grid[0] if p.null is None else p.null) <= p.upper
         if at_null.per_spot:
-            assert [p.size for p in at_null.declared.values()] == [SPOTS]
+            assert [p.size for p in at_null.amplitudes] == [SPOTS]
+            assert all(p.size == 1 for p in at_null.shapes)
         if at_null.witness == "energy":
             assert "gain" in at_null.hooks
         if at_null.witness == "tail":

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,8 @@ class Scan:
         laser, sensor: ``[S, 3]`` wall points, m.
         mean_counts: counts a spot, all bins up to the gate's end.
         background: a rough level of the counts per bin without the scene, the unit of additive effects.
+        light: ``[S, ≥ n_bins]`` what is known of all spots' light beforehand: the capture's own counts, not a
+            copy, unless a model's expected counts are put in their place; None where there are neither.
     """
 
     places: tuple[Tensor, ...]
@@ -38,6 +41,11 @@ class Scan:
     gate: tuple[int, int]
     mean_counts: float
     background: float
+    light: np.ndarray | None = field(default=None, repr=False)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Scan:
+        # Nothing writes into a scan: copies of effects share it, and with it the capture's counts.
+        return self
 
     @property
     def n_spots(self) -> int:
@@ -83,4 +91,5 @@ class Scan:
             gate=capture.gate,
             mean_counts=float(np.nansum(kept)),
             background=max(quietest_level(torch.from_numpy(mean)), 1e-3 * float(np.nanmean(mean))),
+            light=capture.counts,
         )

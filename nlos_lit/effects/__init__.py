@@ -22,6 +22,7 @@ EFFECTS = Registry(
         "higher_order_bounces",
         # time: geometry, then delays, then the clock that measures both
         "wall_tilt",
+        "wall_scale",
         "laser_sensor_baseline",
         "time_drift",
         "timing_jitter",
@@ -35,14 +36,18 @@ EFFECTS = Registry(
         "wall_reflectance",
         "vignetting",
         "ambient_map",
+        "hum",
         "background_slope",
         "hot_spots",
         "direct_leak",
+        "direct_tail",
         # counting
         "afterpulsing",
         "pile_up",
         "tcspc_nonlinearity",
         "gate_edges",
+        "spot_gate",
+        "crosstalk",
     ]
 )
 

@@ -49,7 +49,13 @@ def numbers(effect: type[Effect]) -> str:
     for p in effect.declare(nominal_scan()):
         symbol = re.search(rf"`{p.name}` (\S{{1,2}}) \(", told)
         name = f"`{p.name}` {symbol[1]}" if symbol else f"`{p.name}`"
-        size = "one a spot" if effect.per_spot else f"{p.size} coefficients" if p.size > 1 else ""
+        size = (
+            "one a spot"
+            if effect.per_spot and p.null is not None
+            else f"{p.size} coefficients"
+            if p.size > 1
+            else ""
+        )
         null = "scanned" if p.null is None else f"null {p.null:g}" if p.null else ""
         said.append(" ".join(filter(None, (f"{name} ({p.unit})", null, size))))
     declared = {p.name for p in effect.declare(nominal_scan())}

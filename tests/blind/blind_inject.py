@@ -112,6 +112,14 @@ def wall_tilt(work: Work, angle: float) -> dict[str, float]:
     return {"tilt_x": float(tilt[0]), "tilt_y": float(tilt[1])}
 
 
+def wall_scale(work: Work, scale: float) -> dict[str, float]:
+    scale = scale * float(work.rng.choice([-1, 1]))
+    stated = work.scene.laser
+    middle = (stated.min(axis=0) + stated.max(axis=0)) / 2
+    work.light = work.scene.rendered(wall=middle + (1 + scale) * (stated - middle))
+    return {"scale": scale}
+
+
 def laser_sensor_baseline(work: Work, length: float) -> dict[str, float]:
     towards = work.rng.uniform(0, 2 * np.pi)
     baseline = length * np.array([np.cos(towards), np.sin(towards)])
@@ -164,6 +172,13 @@ def ambient_map(work: Work, rms: float) -> dict[str, float]:
     return {"rms": rms}
 
 
+def hum(work: Work, amplitude: float) -> dict[str, float]:
+    periods, phase = float(work.rng.uniform(5, 28)), work.rng.uniform(0, 2 * np.pi)
+    swing = 1 + amplitude * np.sin(np.pi * periods * (work.rank + 1) + phase)
+    work.background = work.background * swing[:, None]
+    return {"amplitude": amplitude, "frequency": periods}
+
+
 def hot_spots(work: Work, times: float) -> dict[str, float]:
     hot = work.rng.choice(len(work.gain), max(1, len(work.gain) // 100), replace=False)
     extra = times * work.dark * work.rng.uniform(0.6, 1.4, len(hot))
@@ -183,6 +198,18 @@ def direct_leak(work: Work, times: float) -> dict[str, float]:
     amplitude, decay = times * work.dark, float(work.rng.uniform(6, 25))
     work.background = work.background + amplitude * np.exp(-(work.times + 0.5) / decay)
     return {"amplitude": amplitude, "decay": decay * work.bin}
+
+
+def direct_tail(work: Work, times: float) -> dict[str, float]:
+    level, decay = times * work.dark, float(work.rng.uniform(6, 25)) * work.bin
+    reach = float(work.rng.uniform(0.05, 0.4))
+    window = work.scene.window
+    apart = np.sqrt(((work.scene.laser - work.scene.sensor) ** 2).sum(axis=1, keepdims=True))
+    since = window.t_start + (work.times + 0.5) * work.bin - apart
+    # Every spot's own pulse, then a glow that fades; as strong as is said where it is strongest at first.
+    glow = np.where(since > 0, np.exp((window.t_start - since) / decay), 0) / (1 + apart / reach) ** 2
+    work.background = work.background + level * glow / glow[:, 0].max()
+    return {"strongest": level, "decay": decay, "reach": reach}
 
 
 def afterpulsing(work: Work, probability: float) -> dict[str, float]:
@@ -221,6 +248,33 @@ def gate_edges(work: Work, depth: float) -> dict[str, float]:
     rise = (1 - depth * np.exp(-work.times / width)) * (1 - end * np.exp(-work.times[::-1] / width))
     work.counting.append(lambda m: m * rise)
     return {"start": depth, "end": end, "width": width}
+
+
+def spot_gate(work: Work, share: float) -> dict[str, float]:
+    spots = len(work.gain)
+    late = work.rng.choice(spots, max(1, spots // 40), replace=False)
+    arrived = np.cumsum(work.scene.clean.sum(axis=0)) / work.scene.clean.sum()
+    opens = int(np.searchsorted(arrived, work.rng.uniform(0.3, 0.8)) // FINE) - PAD
+
+    def closed(m: np.ndarray) -> np.ndarray:
+        m = m.copy()
+        m[late, :opens] *= 1 - share
+        return m
+
+    work.counting.append(closed)
+    return {"share": share, "number": float(len(late)), "start": float(opens)}
+
+
+def crosstalk(work: Work, leak: float) -> dict[str, float]:
+    lag, taken = int(work.rng.integers(1, 9)), np.argsort(work.rank)
+
+    def again(m: np.ndarray) -> np.ndarray:
+        more = np.zeros_like(m)
+        more[taken[lag:]] = leak * m[taken[:-lag]]
+        return m + more
+
+    work.counting.append(again)
+    return {"leak": leak, "lag": float(lag)}
 
 
 def mains_ripple(work: Work, amplitude: float) -> dict[str, float]:
@@ -282,6 +336,7 @@ EFFECTS: dict[str, Kind] = {
     "timing_jitter": Kind(timing_jitter, (0.3, 0.6, 1.2, 2.5)),
     "clock_scale": Kind(clock_scale, (0.004, 0.012, 0.03, 0.08)),
     "wall_tilt": Kind(wall_tilt, (0.005, 0.01, 0.02, 0.04), OWN),
+    "wall_scale": Kind(wall_scale, (0.01, 0.02, 0.05, 0.1), OWN),
     "laser_sensor_baseline": Kind(laser_sensor_baseline, (0.02, 0.05, 0.12, 0.25), OWN),
     "irf_tail": Kind(irf_tail, (0.03, 0.06, 0.12, 0.25)),
     "ghost_pulse": Kind(ghost_pulse, (0.02, 0.04, 0.08, 0.15)),
@@ -289,13 +344,17 @@ EFFECTS: dict[str, Kind] = {
     "wall_reflectance": Kind(wall_reflectance, (0.05, 0.1, 0.2, 0.35)),
     "vignetting": Kind(vignetting, (0.1, 0.2, 0.5, 1.0)),
     "ambient_map": Kind(ambient_map, (0.1, 0.25, 0.5, 1.0)),
+    "hum": Kind(hum, (0.1, 0.25, 0.5, 0.95)),
     "hot_spots": Kind(hot_spots, (1.0, 3.0, 10.0, 30.0)),
     "background_slope": Kind(background_slope, (0.1, 0.25, 0.5, 0.9)),
     "direct_leak": Kind(direct_leak, (0.5, 1.5, 5.0, 15.0)),
+    "direct_tail": Kind(direct_tail, (0.5, 1.5, 5.0, 15.0)),
     "afterpulsing": Kind(afterpulsing, (0.02, 0.05, 0.12, 0.3)),
     "pile_up": Kind(pile_up, (0.05, 0.1, 0.3, 0.6)),
     "tcspc_nonlinearity": Kind(tcspc_nonlinearity, (0.02, 0.04, 0.08, 0.15)),
     "gate_edges": Kind(gate_edges, (0.1, 0.25, 0.5, 0.9)),
+    "spot_gate": Kind(spot_gate, (0.2, 0.5, 0.8, 0.99)),
+    "crosstalk": Kind(crosstalk, (0.02, 0.05, 0.15, 0.4)),
 }
 UNKNOWN: dict[str, Kind] = {
     "mains_ripple": Kind(mains_ripple, (0.05, 0.1, 0.2, 0.4), axis="scan"),

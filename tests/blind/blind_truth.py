@@ -189,6 +189,7 @@ _RENDERED = {
     "occlusion",
     "higher_order_bounces",
     "wall_tilt",
+    "wall_scale",
     "laser_sensor_baseline",
 }
 

@@ -78,6 +78,40 @@ def test_wall_tilt_is_the_real_change_of_length():
     assert ours.detach() == pytest.approx((moved[0] + moved[1]).detach(), abs=2e-5)
 
 
+def test_a_larger_scan_is_the_model_of_the_moved_points():
+    """Both in length and in light, against surfels traced from the points where they really are."""
+    model, scan = scene("exhaustive")
+    wall, spots = effect("wall_scale", "exhaustive", scale=0.04), torch.arange(SPOTS)
+    stated = model.laser.clone(), model.sensor.clone()
+    paths = model.paths(spots)
+    centre = torch.cat([scan.centre, torch.zeros(1)])
+    model.laser, model.sensor = (centre + 1.04 * (points - centre) for points in stated)
+    real = model.paths(spots)
+    model.laser, model.sensor = stated
+    assert wall.time(paths.length, paths, spots).detach() == pytest.approx(real.length.detach(), abs=2e-3)
+    changed = wall.path(paths.contribution, paths, spots).sum(2).detach()
+    truth = real.contribution.sum(2).detach()
+    lit = truth > 0.05 * truth.max()
+    assert changed[lit] == pytest.approx(truth[lit], rel=0.02)
+
+
+def test_wall_scale_by_hand():
+    # Spots at X = -0.3 and 0.3 about 0. In a scan half as large again the second is at 0.45: the leg to
+    # (0.45, 0, 0.6) shrinks from √(0.15² + 0.6²) to 0.6, what it carries grows by their ratio's fourth power.
+    scan = dataclasses.replace(
+        hand_scan([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]]),
+        places=(torch.tensor([[-1.0, 0], [1.0, 0]]),),
+        half=0.3,
+    )
+    wall = effect("wall_scale", scan=scan)
+    wall.declared["scale"] = dataclasses.replace(wall.declared["scale"], upper=1.0)
+    wall.set("scale", 0.5)
+    paths, spot = hand_paths(centre=(0.45, 0.0, 0.6)), torch.tensor([1])
+    leg = math.hypot(0.15, 0.6)
+    assert wall.time(ONE, paths, spot).item() == pytest.approx(1 - 2 * (leg - 0.6), abs=1e-6)
+    assert wall.path(ONE, paths, spot).item() == pytest.approx((leg / 0.6) ** 8, rel=1e-5)
+
+
 def test_baseline_moves_the_sensor_alone():
     # Sensor (0, 0, 0) looks at (0.3, 0, 0): the leg to (0.3, 0, 0.4) shrinks from 0.5 to 0.4.
     scan = hand_scan([[0.0, 0.0, 0.0]])

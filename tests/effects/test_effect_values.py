@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -119,6 +120,118 @@ def test_backgrounds():
     assert ambient.background(level, spots)[:, 0].detach() == pytest.approx(
         2 * torch.exp(ambient.field()[spots]).detach(), rel=1e-5
     )
+
+
+def test_hum_swings_in_the_order_of_acquisition():
+    """Five spots taken in the order 0, 4, 1, 3, 2: at two periods each is half a period later."""
+    rank = torch.tensor([0.0, 2, 4, 3, 1]) / 2 - 1
+    hum = effect("hum", scan=dataclasses.replace(scene("confocal")[1], rank=rank), cosine=0.3, sine=0.4)
+    hum.set("frequency", 2.0)
+    seen = hum.background(torch.tensor(2.0), torch.arange(5)).detach()
+    assert seen[:, 0].tolist() == pytest.approx([2.6, 2.6, 2.6, 1.4, 1.4], rel=1e-5)
+    hum.set("frequency", 1.0)
+    seen = hum.background(torch.ones(5, LAST), torch.arange(5)).detach()
+    assert seen[:, 9].tolist() == pytest.approx([1.3, 0.7, 1.3, 0.6, 1.4], rel=1e-5)
+    assert hum.quantities()["amplitude"].value.item() == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_frequency_of_the_hum_keeps_most_of_its_power_on_the_grid():
+    scan = dataclasses.replace(scene("confocal")[1], rank=torch.linspace(-1, 1, 1024))
+    f = torch.tensor(effect("hum", scan=scan).declared["frequency"].grid)
+    assert (f[0].item(), f[-1].item(), len(f)) == (2.0, 64.0, 125)
+    u = (scan.rank.double() + 1) / 2
+    for true in (2.25, 10.23, 63.7):
+        wave = torch.sin(2 * math.pi * true * u + 0.4)
+        nearest = f[(f - true).abs().argmin()]
+        basis = torch.stack([torch.cos(2 * math.pi * nearest * u), torch.sin(2 * math.pi * nearest * u)], 1)
+        kept = (basis.T @ wave).square().sum() / (wave.square().sum() * len(u) / 2)
+        assert kept > 0.78
+    # Few spots: no more than one period in two of them.
+    assert effect("hum", "confocal").declared["frequency"].grid[-1] == 4.5
+
+
+def test_the_direct_tail_falls_off_with_distance():
+    """Laser points 0, 0.3 and 0.5 m from the sensor's. The gate opens at 0.62 + 6.5 · 0.02 = 0.75 m, so that
+    t - d is 0.25 m at least.
+    """
+    sensor = [[0.0, 0.0, 0.0]] * 3
+    scan = hand_scan([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.4, 0.0]], sensor)
+    tail = effect("direct_tail", scan=scan, amplitude=9.0, decay=0.25, reach=0.5)
+    seen = tail.background(torch.tensor(1.0), torch.arange(3)).detach()
+    falloff = [1.0, (0.5 / 0.8) ** 2, 0.25]
+    by_hand = [1 + 9 * k * math.exp(-late / 0.25) for k, late in zip(falloff, (0.5, 0.2, 0.0), strict=True)]
+    assert seen[:, FIRST].tolist() == pytest.approx(by_hand, rel=1e-5)
+    later = [1 + (v - 1) * math.exp(-0.2 / 0.25) for v in by_hand]
+    assert seen[:, FIRST + 10].tolist() == pytest.approx(later, rel=1e-5)
+    # Before t0 it stays as it is there.
+    assert seen[:, 0].tolist() == pytest.approx(
+        [1 + 9 * math.exp(-0.38 / 0.25), 1 + 9 * falloff[1] * math.exp(-0.08 / 0.25), 1 + 9 * 0.25], rel=1e-4
+    )
+    assert tail.quantities()["strongest"].value.item() == pytest.approx(max(by_hand) - 1, rel=1e-5)
+
+
+def test_light_that_has_not_arrived_has_no_tail():
+    """Points 1.0 m apart see the pulse at bin (1.0 - 0.62)/0.02 = 19."""
+    scan = hand_scan([[1.0, 0.0, 0.0], [0.1, 0.0, 0.0]], [[0.0, 0.0, 0.0]] * 2)
+    tail = effect("direct_tail", scan=scan, amplitude=9.0, decay=0.25, reach=0.5)
+    seen = tail.background(torch.tensor(0.0), torch.arange(2)).detach()
+    assert seen[0, :19].tolist() == [0.0] * 19
+    assert seen[0, 19].item() == pytest.approx(9 / 9 * math.exp(-0.01 / 0.25), rel=1e-4)
+    assert (seen[1] > 0).all()
+
+
+def test_the_direct_tail_of_a_confocal_scan_is_a_leak():
+    leak = effect("direct_leak", amplitude=5.0, decay=0.3).background(torch.tensor(2.0), torch.arange(3))
+    tail = effect("direct_tail", amplitude=5.0, decay=0.3, reach=0.1)
+    seen = tail.background(torch.tensor(2.0), torch.arange(3)).detach()
+    assert seen[:, FIRST:] == pytest.approx(leak[FIRST:].detach().expand(3, -1), rel=1e-5)
+    assert tail.declared["reach"].grid == (tail.scan.half,)
+
+
+def test_a_gate_of_its_own_closes_what_is_before():
+    lost = torch.zeros(SPOTS)
+    lost[2], lost[7], lost[8] = 1.0, 0.5, 0.1
+    gate = effect("spot_gate", lost=lost, start=20.25)
+    seen = gate.counting(torch.full((3, LAST), 8.0), torch.tensor([2, 7, 0])).detach()
+    assert seen[:, [0, 19, 20, 21]].tolist() == [[0, 0, 6, 8], [4, 4, 7, 8], [8, 8, 8, 8]]
+    told = {n: q.value.item() for n, q in gate.quantities().items()}
+    assert told == {"share": 0.75, "number": 2, "start": 20.25}
+    grid = gate.declared["start"].grid
+    assert grid == tuple(range(FIRST + 1, LAST)), "every bin of a short gate"
+    long = effect("spot_gate", scan=dataclasses.replace(gate.scan, n_bins=1010, gate=(10, 1010)))
+    assert len(long.declared["start"].grid) == 200
+    assert np.diff(long.declared["start"].grid) == pytest.approx(1000 / 201)
+
+
+def test_crosstalk_follows_the_order_of_acquisition():
+    """Spots are taken in the order 2, 0, 3, 1; their records hold 1, 10, 100 and 1000 in that order."""
+    rank = torch.tensor([1.0, 3.0, 0.0, 2.0]) * 2 / 3 - 1
+    counts = np.repeat(np.array([[10], [1000], [1], [100]], dtype=np.uint16), LAST + 3, axis=1)
+    scan = dataclasses.replace(scene("confocal")[1], rank=rank, light=counts)
+    talk = effect("crosstalk", scan=scan, leak=0.5, lag=1.0)
+    dark = torch.zeros(4, LAST)
+    assert talk.counting(dark, torch.arange(4))[:, 5].tolist() == pytest.approx([0.5, 50.0, 0.0, 5.0])
+    assert talk.counting(dark[:2] + 3, torch.tensor([1, 2]))[:, 5].tolist() == pytest.approx([53.0, 3.0])
+    talk.set("lag", 2.25)  # three quarters of the spot two before, a quarter of the one before that
+    assert talk.counting(dark, torch.arange(4))[:, 0].tolist() == pytest.approx(
+        [0.0, 0.5 * (7.5 + 0.25), 0.0, 0.375]
+    )
+    talk.set("lag", 3.0)
+    talk.settle(torch.full((4, LAST - FIRST), 8.0))
+    assert talk.counting(dark, torch.arange(4))[:, FIRST].tolist() == pytest.approx([0.0, 4.0, 0.0, 0.0])
+    assert talk.counting(dark, torch.arange(4))[1, FIRST - 1].item() == 0
+
+
+def test_copies_share_what_is_known_of_all_spots():
+    talk = effect("crosstalk", leak=0.2)
+    again = copy.deepcopy(talk)
+    assert again.light is talk.light
+    assert again.scan is talk.scan
+    again.set("leak", 0.5)
+    again.settle(torch.ones(SPOTS, LAST))
+    assert talk.value("leak").item() == pytest.approx(0.2)
+    assert not torch.equal(again.light, talk.light)
+    assert "light" not in talk.state_dict()
 
 
 def test_afterpulsing_by_hand():

@@ -25,6 +25,7 @@ KNOWN = {
     "occlusion": PATH,
     "higher_order_bounces": PATH,
     "wall_tilt": TIME,
+    "wall_scale": TIME,
     "laser_sensor_baseline": TIME,
     "time_drift": TIME,
     "timing_jitter": TIME,
@@ -36,13 +37,17 @@ KNOWN = {
     "wall_reflectance": SPOT,
     "vignetting": SPOT,
     "ambient_map": SPOT,
+    "hum": SPOT,
     "background_slope": SPOT,
     "hot_spots": SPOT,
     "direct_leak": SPOT,
+    "direct_tail": SPOT,
     "afterpulsing": COUNTING,
     "pile_up": COUNTING,
     "tcspc_nonlinearity": COUNTING,
     "gate_edges": COUNTING,
+    "spot_gate": COUNTING,
+    "crosstalk": COUNTING,
 }
 
 
@@ -68,8 +73,8 @@ def test_stage_and_need_of_paths_follow_from_the_hooks():
         assert "stage" in vars(effect), "it is computed for each class"
     moving = {name for name in KNOWN if EFFECTS.named(name)(Scan.of(capture("single"))).moves_light}
     assert moving == {
-        *("retroreflection", "specular_lobe", "occlusion", "wall_tilt", "laser_sensor_baseline"),
-        *("time_drift", "timing_jitter", "time_offset", "clock_scale"),
+        *("retroreflection", "specular_lobe", "occlusion", "wall_tilt", "wall_scale"),
+        *("laser_sensor_baseline", "time_drift", "timing_jitter", "time_offset", "clock_scale"),
         *("power_drift", "wall_reflectance", "vignetting"),
     }
 
@@ -91,7 +96,7 @@ def test_a_hook_inherited_counts_as_overridden():
 def test_effects_act_in_the_order_of_stages():
     stages = [STAGES.index(effect.stage) for effect in EFFECTS]
     assert stages == sorted(stages)
-    last = ["afterpulsing", "pile_up", "tcspc_nonlinearity", "gate_edges"]
+    last = ["afterpulsing", "pile_up", "tcspc_nonlinearity", "gate_edges", "spot_gate", "crosstalk"]
     assert [name for name in EFFECTS.names if name in last] == last
 
 
