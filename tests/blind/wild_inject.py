@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from blind_elements import Legs
-from blind_scenes import FINE
+from blind_scenes import FINE, PAD
 from blind_work import blotches
 from scipy.signal import fftconvolve, lfilter
 from scipy.special import ndtr, ndtri
@@ -119,15 +119,6 @@ def power_walk(work: WildWork, span: float) -> Values:
     return _power(work, span, walk(work))
 
 
-def hum_harmonics(work: WildWork, amplitude: float) -> Values:
-    cycles, rng = float(work.rng.uniform(9, 40)), work.rng
-    wave = np.sin(2 * np.pi * cycles * work.along + rng.uniform(0, 2 * np.pi))
-    for k, size in ((2, rng.uniform(0.2, 0.5)), (3, rng.uniform(0.1, 0.3))):
-        wave = wave + size * np.sin(2 * np.pi * k * cycles * work.along + rng.uniform(0, 2 * np.pi))
-    work.gain = work.gain * (1 + amplitude * wave / np.abs(wave).max())
-    return {"amplitude": amplitude, "cycles": cycles}
-
-
 def wall_blotches(work: WildWork, rms: float) -> Values:
     """Patches of another paint, with soft edges."""
     stain = np.tanh(1.5 * blotches(work))
@@ -166,6 +157,15 @@ def ambient_window(work: WildWork, share: float) -> Values:
     shape = 1 - share + share * light / light.mean()
     work.background = work.background * shape[:, None]
     return {"rms": float(np.log(shape).std())}
+
+
+def hum_harmonics(work: WildWork, depth: float) -> Values:
+    """Lamps at the mains, beating with the scan: ambient light like a rectified sine, with its harmonics."""
+    periods, phase = float(work.rng.uniform(5, 30)), work.rng.uniform(0, 2 * np.pi)
+    lamp = np.abs(np.sin(np.pi * periods * work.along + phase)) ** work.rng.uniform(0.7, 1.6)
+    swing = 1 - depth + depth * lamp / lamp.mean()
+    work.background = work.background * swing[:, None]
+    return {"depth": depth, "frequency": periods}
 
 
 def hot_spots_log_normal(work: WildWork, times: float) -> Values:
@@ -218,15 +218,18 @@ def gate_erf(work: WildWork, depth: float) -> Values:
     return {"start": depth, "end": end, "width": width * work.bin}
 
 
-def spot_gates(work: WildWork, bins: float) -> Values:
-    """Every spot's gate opens at a bin of its own, with a margin before its first light, or too late."""
-    signal = work.signal()
-    arrived = np.cumsum(signal, axis=1) / signal.sum(axis=1, keepdims=True)
-    first = (arrived > 0.005).argmax(axis=1)
-    opens = first - 4 + bins * work.rng.standard_normal(len(first))
-    gate = ndtr((work.times - opens[:, None]) / 0.6)
-    work.count(lambda m: m * gate + 1e-3 * work.dark)
-    return {"rms": bins * work.bin, "opens": float(opens.mean() * work.bin)}
+def spot_gates(work: WildWork, share: float) -> Values:
+    """Some spots' gates open late, each at a bin of its own near a common one, and not all of the way."""
+    rng, spots = work.rng, len(work.gain)
+    arrived = np.cumsum(work.scene.clean.sum(axis=0))
+    common = np.searchsorted(arrived / arrived[-1], rng.uniform(0.35, 0.85)) / FINE - PAD
+    late = rng.choice(spots, round(spots * rng.uniform(0.015, 0.05)), replace=False)
+    opens = common + rng.uniform(1, 4) * rng.standard_normal(len(late))
+    lost = np.minimum(share * rng.uniform(0.8, 1.2, len(late)), 0.995)
+    gate = np.ones((spots, len(work.times)))
+    gate[late] = 1 - lost[:, None] * ndtr((opens[:, None] - work.times) / 0.7)
+    work.count(lambda m: m * gate)
+    return {"share": float(lost.mean()), "number": float(len(late)), "start": float(common)}
 
 
 def code_widths(work: WildWork, rms: float) -> Values:
@@ -324,7 +327,7 @@ def wall_tilt_bow(work: WildWork, angle: float) -> Values:
 
 def wall_scaled(work: WildWork, scale: float) -> Values:
     """Mirrors whose gains are off: x and y are not what the file says, by unlike factors."""
-    off = scale * np.array([1.0, work.rng.uniform(-1, 0.4)]) * work.rng.choice([-1, 1])
+    off = scale * np.array([1.0, work.rng.uniform(0, 0.8)]) * work.rng.choice([-1, 1])
     off = off[work.rng.permutation(2)]
     work.light = work.scene.rendered(wall=lambda points: points * [1 + off[0], 1 + off[1], 1])
     return {"scale_x": float(off[0]), "scale_y": float(off[1])}
@@ -371,9 +374,9 @@ class Hidden:
 WALL = ("wall_reflectance", "vignetting", "power_drift")
 # In the order of the light's way.
 EFFECTS: dict[str, Hidden] = {
-    "retro_paint": Hidden(retro_paint, (0.1, 0.3, 0.8), ("retroreflection",), own=True, scan="confocal"),
-    "gloss": Hidden(gloss, (0.03, 0.1, 0.4), ("specular_lobe",), own=True, scan="confocal"),
-    "occluder_ragged": Hidden(occluder_ragged, (0.2, 0.5, 1.0), ("occlusion",), own=True),
+    "retro_paint": Hidden(retro_paint, (0.03, 0.1, 0.4), ("retroreflection",), own=True, scan="confocal"),
+    "gloss": Hidden(gloss, (0.05, 0.15, 0.5), ("specular_lobe",), own=True, scan="confocal"),
+    "occluder_ragged": Hidden(occluder_ragged, (0.1, 0.3, 0.9), ("occlusion",), own=True),
     "fourth_bounces": Hidden(
         fourth_bounces,
         (0.5, 1.0, 2.0),
@@ -382,38 +385,38 @@ EFFECTS: dict[str, Hidden] = {
         scan="confocal",
         families=("sheet",),
     ),
-    "wall_tilt_bow": Hidden(wall_tilt_bow, (0.008, 0.02, 0.05), ("wall_tilt",), own=True),
-    "wall_scaled": Hidden(wall_scaled, (0.015, 0.04, 0.1), ("wall_scale",), own=True),
+    "wall_tilt_bow": Hidden(wall_tilt_bow, (0.006, 0.015, 0.04), ("wall_tilt",), own=True),
+    "wall_scaled": Hidden(wall_scaled, (0.008, 0.025, 0.08), ("wall_scale",), own=True),
     "baseline_skewed": Hidden(
-        baseline_skewed, (0.03, 0.08, 0.2), ("laser_sensor_baseline",), own=True, scan="confocal"
+        baseline_skewed, (0.02, 0.06, 0.15), ("laser_sensor_baseline",), own=True, scan="confocal"
     ),
-    "time_offset": Hidden(time_offset, (0.7, 2.0, 5.0), ("time_offset",)),
+    "time_offset": Hidden(time_offset, (0.5, 1.5, 5.0), ("time_offset",)),
     "time_warm_up": Hidden(time_warm_up, (0.5, 1.2, 3.0), ("time_drift",)),
     "time_walk": Hidden(time_walk, (0.5, 1.2, 3.0), ("time_drift",)),
-    "jitter_heavy": Hidden(jitter_heavy, (0.3, 0.7, 1.6), ("timing_jitter",)),
-    "clock_scale": Hidden(clock_scale, (0.008, 0.025, 0.06), ("clock_scale",)),
+    "jitter_heavy": Hidden(jitter_heavy, (0.2, 0.5, 1.3), ("timing_jitter",)),
+    "clock_scale": Hidden(clock_scale, (0.006, 0.02, 0.06), ("clock_scale",)),
     "tail_two_exponentials": Hidden(
-        tail_two_exponentials, (0.04, 0.1, 0.25), ("irf_tail",), ("afterpulsing",)
+        tail_two_exponentials, (0.02, 0.06, 0.18), ("irf_tail",), ("afterpulsing",)
     ),
-    "tail_power_law": Hidden(tail_power_law, (0.04, 0.1, 0.25), ("irf_tail",), ("afterpulsing",)),
-    "ghost_echoes": Hidden(ghost_echoes, (0.02, 0.05, 0.14), ("ghost_pulse",)),
+    "tail_power_law": Hidden(tail_power_law, (0.02, 0.06, 0.18), ("irf_tail",), ("afterpulsing",)),
+    "ghost_echoes": Hidden(ghost_echoes, (0.012, 0.035, 0.1), ("ghost_pulse",)),
     "power_warm_up": Hidden(power_warm_up, (0.1, 0.25, 0.6), ("power_drift",), ("wall_reflectance",)),
     "power_walk": Hidden(power_walk, (0.1, 0.25, 0.6), ("power_drift",), ("wall_reflectance",)),
-    "hum_harmonics": Hidden(hum_harmonics, (0.05, 0.12, 0.3), ("hum",)),
-    "wall_blotches": Hidden(wall_blotches, (0.06, 0.14, 0.3), ("wall_reflectance",), WALL[1:]),
-    "wall_scratches": Hidden(wall_scratches, (0.15, 0.35, 0.7), ("wall_reflectance",), WALL[1:]),
-    "vignetting_cos4": Hidden(vignetting_cos4, (0.1, 0.25, 0.5), ("vignetting",), ("wall_reflectance",)),
+    "wall_blotches": Hidden(wall_blotches, (0.03, 0.08, 0.2), ("wall_reflectance",), WALL[1:]),
+    "wall_scratches": Hidden(wall_scratches, (0.06, 0.15, 0.4), ("wall_reflectance",), WALL[1:]),
+    "vignetting_cos4": Hidden(vignetting_cos4, (0.05, 0.12, 0.35), ("vignetting",), ("wall_reflectance",)),
     "ambient_window": Hidden(ambient_window, (0.15, 0.4, 0.9), ("ambient_map",)),
+    "hum_harmonics": Hidden(hum_harmonics, (0.15, 0.4, 0.95), ("hum",)),
     "hot_spots_log_normal": Hidden(hot_spots_log_normal, (0.7, 3.0, 12.0), ("hot_spots",)),
-    "background_curve": Hidden(background_curve, (0.15, 0.4, 0.9), ("background_slope",), ("direct_leak",)),
-    "leak_power_law": Hidden(leak_power_law, (1.0, 3.0, 12.0), ("direct_leak",), ("background_slope",)),
+    "background_curve": Hidden(background_curve, (0.25, 0.5, 0.95), ("background_slope",), ("direct_leak",)),
+    "leak_power_law": Hidden(leak_power_law, (1.5, 5.0, 15.0), ("direct_leak",), ("background_slope",)),
     "direct_tail_two": Hidden(
         direct_tail_two, (0.3, 1.0, 4.0), ("direct_tail",), ("direct_leak",), scan="single"
     ),
-    "gate_erf": Hidden(gate_erf, (0.2, 0.5, 0.95), ("gate_edges",)),
-    "spot_gates": Hidden(spot_gates, (1.0, 3.0, 8.0), ("spot_gate",)),
+    "gate_erf": Hidden(gate_erf, (0.4, 0.8, 0.99), ("gate_edges",)),
+    "spot_gates": Hidden(spot_gates, (0.3, 0.6, 0.97), ("spot_gate",)),
     "pile_up_dead_time": Hidden(pile_up, (0.06, 0.18, 0.5), ("pile_up",)),
-    "afterpulses_two_traps": Hidden(afterpulses, (0.03, 0.1, 0.25), ("afterpulsing",), ("irf_tail",)),
-    "crosstalk_fading": Hidden(crosstalk, (0.015, 0.05, 0.15), ("crosstalk",)),
-    "code_widths": Hidden(code_widths, (0.02, 0.06, 0.15), ("tcspc_nonlinearity",)),
+    "afterpulses_two_traps": Hidden(afterpulses, (0.012, 0.04, 0.15), ("afterpulsing",), ("irf_tail",)),
+    "crosstalk_fading": Hidden(crosstalk, (0.01, 0.03, 0.1), ("crosstalk",)),
+    "code_widths": Hidden(code_widths, (0.025, 0.06, 0.15), ("tcspc_nonlinearity",)),
 }

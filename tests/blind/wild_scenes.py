@@ -10,13 +10,14 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from blind_elements import Elements, Legs, cut, fourth_bounce, sight, third_bounce
 from blind_scenes import RENDERS, Scene, Window, finer
 
 from data_modules.readers import read_capture
-from data_modules.simulate import Mesh, join, wall_grid
+from data_modules.simulate import Mesh, join, load_truth, wall_grid
 from data_modules.simulate.bodies import (
     Bend,
     Body,
@@ -45,9 +46,15 @@ SINGLE_RENDERS = ("z_single_32_d3", "bunny_single_32_d3", "sphereplate_single_32
 
 @dataclass(frozen=True)
 class WildScene(Scene):
-    """A scan and the light that it sees, confocal or with one laser point."""
+    """A scan and the light that it sees, confocal or with one laser point.
+
+    Args:
+        size: of elements, m.
+        proxy: about where a render's surface is, all in view; nothing that is measured hangs on it.
+    """
 
     size: float = 0.01
+    proxy: Elements | None = None
 
     @property
     def places(self) -> np.ndarray:
@@ -307,7 +314,21 @@ def _render(rng: np.random.Generator, confocal: bool, side: int) -> WildScene:
     n_bins, before, after = int(rng.integers(170, 241)), rng.uniform(9, 20), rng.uniform(16, 32)
     window = _window(low, high, n_bins, before, after)
     clean = finer(light, capture.t_start, capture.bin_length, window.fine)
-    return WildScene("render", window, sensor if confocal else laser, sensor, clean)
+    centre, normal, *rest = _surface(RENDERS / f"{name.split('_')[0]}_gt.h5")
+    proxy = Elements(_mirrored(centre, flip, swap), _mirrored(normal, flip, swap), *rest)
+    return WildScene("render", window, sensor if confocal else laser, sensor, clean, proxy=proxy)
+
+
+def _surface(path: Path) -> tuple[np.ndarray, ...]:
+    """Centres, normals, areas and albedos of a depth map's cells."""
+    truth = load_truth(path)
+    stride = max(1, len(truth.x) // 80)
+    x, y = truth.x[::stride], truth.y[::stride]
+    depth, normal = truth.depth[::stride, ::stride], truth.normal[::stride, ::stride]
+    there = np.isfinite(depth) & (normal[..., 2] < -0.1)
+    area = np.ptp(x) / (len(x) - 1) * np.ptp(y) / (len(y) - 1) / -normal[there][:, 2]
+    grid = np.stack([*np.meshgrid(x, y, indexing="ij"), depth], axis=2)
+    return grid[there], normal[there], area, np.ones(len(area))
 
 
 def _mirrored(points: np.ndarray, flip: np.ndarray, swap: bool) -> np.ndarray:

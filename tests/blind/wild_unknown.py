@@ -64,7 +64,7 @@ def rolling_gate(work: WildWork, share: float) -> Values:
     last = float(np.searchsorted(arrived / arrived[-1], share) / FINE - PAD)
     opens = last * work.along ** work.rng.uniform(0.7, 1.5)
     gate = ndtr((work.times - opens[:, None]) / 1.2)
-    work.count(lambda m: m * gate + 1e-3 * work.dark)
+    work.count(lambda m: m * np.maximum(gate, 1e-3))
     return {"last": last * work.bin}
 
 
@@ -80,6 +80,17 @@ def mode_hops(work: WildWork, fraction: float) -> Values:
     return {"fraction": fraction, "delay": late * work.bin / FINE, "share": float(on.mean())}
 
 
+def power_ripple(work: WildWork, amplitude: float) -> Values:
+    """The laser's power ripples while the scan goes on, with harmonics."""
+    rng, cycles = work.rng, float(work.rng.uniform(10, 40))
+    wave = sum(
+        size * np.sin(2 * np.pi * k * cycles * work.along + rng.uniform(0, 2 * np.pi))
+        for k, size in ((1, 1.0), (2, rng.uniform(0.2, 0.5)), (3, rng.uniform(0.1, 0.3)))
+    )
+    work.gain = work.gain * (1 + amplitude * wave / np.abs(wave).max())
+    return {"amplitude": amplitude, "cycles": cycles}
+
+
 def gain_scatter(work: WildWork, rms: float) -> Values:
     """Every spot has a gain of its own."""
     work.gain = work.gain * np.exp(rms * work.rng.standard_normal(len(work.gain)))
@@ -87,13 +98,14 @@ def gain_scatter(work: WildWork, rms: float) -> Values:
 
 
 UNKNOWN: dict[str, Hidden] = {
-    "moving_object": Hidden(moving_object, (1.0, 2.5, 6.0), own=True, axes=("scan", "time×scan")),
+    "moving_object": Hidden(moving_object, (0.5, 1.5, 5.0), own=True, axes=("scan", "time×scan")),
     "widening_response": Hidden(widening_response, (1.2, 2.5, 5.0), axes=("time×scan", "scan")),
-    "focus_response": Hidden(focus_response, (1.2, 2.5, 5.0), axes=("time×wall", "wall")),
-    "mode_hops": Hidden(mode_hops, (0.06, 0.15, 0.4), axes=("time×scan", "scan")),
-    "dead_columns": Hidden(dead_columns, (0.12, 0.3, 0.7), axes=("wall",)),
-    "gain_scatter": Hidden(gain_scatter, (0.06, 0.15, 0.4), axes=("wall", "scan", "spot")),
+    "focus_response": Hidden(focus_response, (1.5, 2.5, 5.0), axes=("time×wall", "wall")),
+    "mode_hops": Hidden(mode_hops, (0.04, 0.1, 0.3), axes=("time×scan", "scan")),
+    "dead_columns": Hidden(dead_columns, (0.1, 0.25, 0.6), axes=("wall",)),
+    "power_ripple": Hidden(power_ripple, (0.06, 0.15, 0.4), axes=("scan",)),
+    "gain_scatter": Hidden(gain_scatter, (0.05, 0.12, 0.3), axes=("wall", "scan", "spot")),
     "rolling_gate": Hidden(rolling_gate, (0.02, 0.08, 0.25), axes=("time×scan", "time", "scan")),
-    "missing_codes": Hidden(missing_codes, (0.12, 0.35, 0.8), axes=("time",)),
-    "saturation": Hidden(saturation, (0.1, 0.4, 1.5), axes=("rate",)),
+    "missing_codes": Hidden(missing_codes, (0.1, 0.3, 0.8), axes=("time",)),
+    "saturation": Hidden(saturation, (0.08, 0.3, 1.2), axes=("rate",)),
 }
