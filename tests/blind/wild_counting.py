@@ -100,7 +100,7 @@ def afterpulses(work: WildWork, probability: float) -> dict[str, float]:
         # Normalised over all times: what comes after the window is lost.
         kernel[1:] += probability * part * np.exp(-late / decay) * np.expm1(1 / decay)
     work.count(lambda m: np.maximum(fftconvolve(m, kernel[None], axes=1)[:, : m.shape[1]], 0))
-    return {"probability": probability, "fast": fast * work.bin, "slow": slow * work.bin}
+    return {"probability": probability, "share": share, "fast": fast * work.bin, "slow": slow * work.bin}
 
 
 def crosstalk(work: WildWork, fraction: float) -> dict[str, float]:

@@ -33,7 +33,7 @@ def tail_two_exponentials(work: WildWork, fraction: float) -> Values:
         return total
 
     work.response.append(tail)
-    return {"fraction": fraction, "fast": float(fast), "slow": float(slow)}
+    return {"fraction": fraction, "share": share, "fast": float(fast), "slow": float(slow)}
 
 
 def tail_power_law(work: WildWork, fraction: float) -> Values:

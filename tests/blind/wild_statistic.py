@@ -18,6 +18,7 @@ from wild_truth import Truth
 from data_modules.simulate.sensor import response_kernel
 
 PATCHES = 96
+MOST = 10_000  # elements that make the patches
 ALBEDO = 1.0  # prior standard deviation of a patch's log albedo
 BINS = 3.0  # of the path to a patch, bins
 WIDTH = 0.5  # of the response's logarithmic widths
@@ -87,7 +88,7 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
         model = at @ design
         slope = design @ (1 - target / model)
         bend = (design * (target / model**2)) @ design.T
-        step, size = np.linalg.solve(bend, slope), 1.0
+        step, size = np.linalg.lstsq(bend, slope)[0], 1.0
         before = divergence(at)
         while divergence(at - size * step) > before and size > 1e-6:
             size /= 2
@@ -104,10 +105,8 @@ def nuisances(truth: Truth) -> np.ndarray:
     away from the wall's middle delays its light at every spot by what its way grows.
     """
     scene = truth.scene
-    elements = scene.elements if scene.own else scene.proxy
-    seen = scene.seen if scene.own else np.ones((len(scene.laser), len(elements.area)), dtype=bool)
-    clean = scene.window.bin_length
-    kernel, first = response_kernel(*_widths(truth), clean / HALF)
+    elements, seen = _thinned(scene)
+    kernel, first = response_kernel(*_widths(truth), scene.window.bin_length / HALF)
     groups = patches(elements, PATCHES)
     factor = _factor(truth, scene, elements, seen)
     albedo, depth = [], []
@@ -119,6 +118,16 @@ def nuisances(truth: Truth) -> np.ndarray:
         depth.append(-BINS * _bins(_slope(wide)) * _growth(scene, mine)[:, None])
     total = np.sum(albedo, axis=0) / ALBEDO
     return np.stack([*albedo, *depth, *_width_changes(truth, scene, total)]).astype(np.float32)
+
+
+def _thinned(scene: WildScene) -> tuple[Elements, np.ndarray]:
+    """No more than about `MOST` elements, evenly taken, and whether they are in view."""
+    elements = scene.elements if scene.own else scene.proxy
+    step = -(-len(elements.area) // MOST)
+    few = elements.of(slice(None, None, step))
+    if not scene.own:
+        return few, np.ones((len(scene.laser), len(few.area)), dtype=bool)
+    return few, np.ascontiguousarray(scene.seen[:, ::step])
 
 
 def patches(elements: Elements, number: int) -> np.ndarray:

@@ -62,7 +62,7 @@ def rolling_gate(work: WildWork, share: float) -> Values:
     """The gate opens ever later while the scan goes on; at its end a share of the light has come before."""
     arrived = np.cumsum(work.scene.clean.sum(axis=0))
     last = float(np.searchsorted(arrived / arrived[-1], share) / FINE - PAD)
-    opens = last * work.along ** work.rng.uniform(0.7, 1.5)
+    opens = -4 + (last + 4) * work.along ** work.rng.uniform(0.7, 1.5)
     gate = ndtr((work.times - opens[:, None]) / 1.2)
     work.count(lambda m: m * np.maximum(gate, 1e-3))
     return {"last": last * work.bin}
