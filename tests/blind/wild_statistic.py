@@ -6,11 +6,11 @@ what one could expect that has to fit the scene, the response and the background
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from blind_elements import Axis, Elements, third_bounce
-from blind_scenes import PAD
+from blind_scenes import FINE, PAD
 from scipy.signal import fftconvolve
 from wild_scenes import WildScene
 from wild_truth import Truth
@@ -40,17 +40,27 @@ class Statistic:
     projected: float
 
 
-def true_statistics(truth: Truth) -> dict[str, Statistic]:
+def true_statistics(truth: Truth, steps: int = 0) -> dict[str, Statistic]:
     """Of every injection, each against the capture that lacks only it.
 
     Exposure and dark level are in no file, so every method fits both: hence the factor and the level. The
     second number is linear in the changes of the scene: for effects that move light by more than the
-    response is wide it is too large.
+    response is wide it is too large, unless the scene is seen anew after each of some steps.
+
+    Args:
+        truth: of the capture.
+        steps: how often at most the changed scene is seen anew (own scenes only; some seconds each).
     """
     if not truth.names:
         return {}
     basis = nuisances(truth)
-    return {name: statistic(truth.expected, truth.lacking[name], basis) for name in truth.names}
+    found = {name: statistic(truth.expected, truth.lacking[name], basis) for name in truth.names}
+    if not truth.scene.own:
+        return found
+    return {
+        name: replace(first, projected=refined(truth, name, basis, first.projected, steps))
+        for name, first in found.items()
+    }
 
 
 def statistic(with_: np.ndarray, without: np.ndarray, basis: np.ndarray) -> Statistic:
@@ -60,19 +70,67 @@ def statistic(with_: np.ndarray, without: np.ndarray, basis: np.ndarray) -> Stat
         with_, without: ``[S, T]`` expected counts.
         basis: ``[K, S, T]`` changes of the expected counts by one prior standard deviation.
     """
+    inner, slope = _normal(with_, without, basis, np.zeros(len(basis)))
+    plain = float(divergence(with_, without)[0].sum())
+    return Statistic(plain, max(0.0, plain - float(slope @ np.linalg.solve(inner, slope))))
+
+
+def refined(truth: Truth, name: str, basis: np.ndarray, projected: float, steps: int) -> float:
+    """The projected number with the scene seen anew at the changes that take up most.
+
+    Args:
+        truth, name: of the capture, and the injection.
+        basis: of the scene as it is. projected: with it.
+        steps: at most.
+    """
+    change = np.zeros(len(basis))
+    start, lacking = rendering(truth, change), truth.lacking[name]
+
+    def without(change: np.ndarray) -> np.ndarray:
+        # Where another effect has taken light away, the scene cannot take away more than there is.
+        return np.maximum(lacking + rendering(truth, change) - start, 0.01 * lacking)
+
+    least = divergence(truth.expected, lacking)[0].sum()
+    for _ in range(steps):
+        inner, slope = _normal(truth.expected, without(change), basis, change)
+        for damping in (0, 1, 10, 100):
+            bent = inner + damping * np.diag(np.diag(inner))
+            tried = change + np.linalg.solve(bent, slope)[: len(change)]
+            now = divergence(truth.expected, without(tried))[0].sum() + tried @ tried
+            if now < least:
+                break
+        else:
+            break
+        settled, change, least = now > 0.95 * least, tried, now
+        basis = nuisances(truth, change)
+        inner, slope = _normal(truth.expected, without(change), basis, change)
+        projected = min(projected, max(0.0, float(now - slope @ np.linalg.solve(inner, slope))))
+        if settled:
+            break
+    return projected
+
+
+def divergence(with_: np.ndarray, without: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Twice the divergence in every bin, and its signed root, with factor and level at their best."""
     fitted = profiled(with_, without)
     gap = with_ - fitted
-    plain = 2 * np.maximum(with_ * np.log(with_ / fitted) - gap, 0)
-    # Signed roots of the divergence: their squares sum to it, and for small gaps they are gap/√counts.
-    residual = (np.sign(gap) * np.sqrt(plain)).ravel().astype(np.float32)
-    free = np.stack([fitted, np.ones_like(fitted)]).reshape(2, -1)
-    free = 1e3 * free / np.linalg.norm(free / np.sqrt(with_).ravel(), axis=1, keepdims=True)
+    each = 2 * np.maximum(with_ * np.log(with_ / fitted) - gap, 0)
+    # The roots' squares sum to it, and for small gaps they are gap/√counts.
+    return each, np.sign(gap) * np.sqrt(each)
+
+
+def _normal(
+    with_: np.ndarray, without: np.ndarray, basis: np.ndarray, change: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations of a further change, with the prior; factor and level come last, and are free."""
+    root = np.sqrt(with_).ravel()
+    free = np.stack([without, np.ones_like(without)]).reshape(2, -1)
+    free = 1e3 * free / np.linalg.norm(free / root, axis=1, keepdims=True)
     design = np.concatenate([basis.reshape(len(basis), -1), free.astype(np.float32)])
-    design /= np.sqrt(with_).ravel().astype(np.float32)
+    design /= root.astype(np.float32)
+    residual = divergence(with_, without)[1].ravel().astype(np.float32)
     inner = (design @ design.T).astype(np.float64) + np.eye(len(design))
-    seen = (design @ residual).astype(np.float64)
-    whole = float(plain.sum())
-    return Statistic(whole, max(0.0, whole - float(seen @ np.linalg.solve(inner, seen))))
+    return inner, (design @ residual).astype(np.float64) - np.concatenate([change, [0, 0]])
 
 
 def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
@@ -80,7 +138,7 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
     design = np.stack([without.ravel(), np.full(without.size, without.mean())])
     at, target = np.array([with_.sum() / without.sum(), 0.0]), with_.ravel()
 
-    def divergence(at: np.ndarray) -> float:
+    def cost(at: np.ndarray) -> float:
         model = at @ design
         return np.inf if model.min() <= 0 else float((model - target * np.log(model)).sum())
 
@@ -89,8 +147,8 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
         slope = design @ (1 - target / model)
         bend = (design * (target / model**2)) @ design.T
         step, size = np.linalg.lstsq(bend, slope)[0], 1.0
-        before = divergence(at)
-        while divergence(at - size * step) > before and size > 1e-6:
+        before = cost(at)
+        while cost(at - size * step) > before and size > 1e-6:
             size /= 2
         at = at - size * step
         if slope @ step < 1e-6:
@@ -98,17 +156,20 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
     return (at @ design).reshape(without.shape)
 
 
-def nuisances(truth: Truth) -> np.ndarray:
+def nuisances(truth: Truth, change: np.ndarray | None = None) -> np.ndarray:
     """``[K, S, T]`` changes of counts by patches' albedos and paths and the response's two widths.
 
     Each is for one prior standard deviation. Rendered patch by patch from the clean scene; a patch that moves
     away from the wall's middle delays its light at every spot by what its way grows.
+
+    Args:
+        truth: of the capture.
+        change: ``[K]`` at which they are taken, prior standard deviations; None for none.
     """
     scene = truth.scene
-    elements, seen = _thinned(scene)
-    kernel, first = response_kernel(*_widths(truth), scene.window.bin_length / HALF)
-    groups = patches(elements, PATCHES)
-    factor = _factor(truth, scene, elements, seen)
+    elements, seen, groups, widths = _changed(truth, change)
+    kernel, first = response_kernel(*widths, scene.window.bin_length / HALF)
+    factor = _factor(truth)
     albedo, depth = [], []
     for k in range(groups.max() + 1):
         mine = elements.of(groups == k)
@@ -117,7 +178,35 @@ def nuisances(truth: Truth) -> np.ndarray:
         albedo.append(ALBEDO * _bins(wide))
         depth.append(-BINS * _bins(_slope(wide)) * _growth(scene, mine)[:, None])
     total = np.sum(albedo, axis=0) / ALBEDO
-    return np.stack([*albedo, *depth, *_width_changes(truth, scene, total)]).astype(np.float32)
+    return np.stack([*albedo, *depth, *_width_changes(scene, widths, total)]).astype(np.float32)
+
+
+def rendering(truth: Truth, change: np.ndarray) -> np.ndarray:
+    """``[S, T]`` counts of the scene with that change of patches and response, without background."""
+    scene = truth.scene
+    elements, seen, _, widths = _changed(truth, change)
+    light = _factor(truth) * third_bounce(elements, scene.laser, scene.sensor, seen, _axis(scene))
+    return _bins(_smeared(light, *response_kernel(*widths, scene.window.bin_length / HALF)))
+
+
+def _changed(
+    truth: Truth, change: np.ndarray | None
+) -> tuple[Elements, np.ndarray, np.ndarray, tuple[float, float]]:
+    """Elements, whether they are in view, their patches, and the response's σ and κ."""
+    scene = truth.scene
+    elements, seen = _thinned(scene)
+    groups = patches(elements, PATCHES)
+    sigma, decay = truth.response
+    if change is None:
+        return elements, seen, groups, (sigma, 1 / decay)
+    number = groups.max() + 1
+    lit, far, (wider, sharper) = change[:number], change[number : 2 * number], change[2 * number :]
+    away = np.stack([_away(scene, elements.of(groups == k)) for k in range(number)])
+    way = far * BINS * scene.window.bin_length / 2
+    moved = elements.centre + (way[:, None] * away)[groups]
+    bright = elements.albedo * np.exp(ALBEDO * lit.clip(-3, 3))[groups]
+    limits = (sigma * np.exp(WIDTH * np.clip(wider, -3, 3)), np.exp(WIDTH * np.clip(sharper, -3, 3)) / decay)
+    return replace(elements, centre=moved, albedo=bright), seen, groups, limits
 
 
 def _thinned(scene: WildScene) -> tuple[Elements, np.ndarray]:
@@ -147,19 +236,16 @@ def patches(elements: Elements, number: int) -> np.ndarray:
     return labels
 
 
-def _widths(truth: Truth) -> tuple[float, float]:
-    sigma, decay = truth.response
-    return sigma, 1 / decay
-
-
 def _axis(scene: WildScene) -> Axis:
     window = scene.window
     step = window.bin_length
     return Axis(window.t_start - PAD * step, step / HALF, HALF * (window.n_bins + 2 * PAD))
 
 
-def _factor(truth: Truth, scene: WildScene, elements: Elements, seen: np.ndarray) -> float:
+def _factor(truth: Truth) -> float:
     """Counts for each unit of rendered light."""
+    scene = truth.scene
+    elements, seen = _thinned(scene)
     some = slice(0, None, max(1, len(seen) // 32))
     laser = scene.laser[some]
     sensor = laser if scene.confocal else scene.sensor[some]
@@ -191,20 +277,25 @@ def _bins(light: np.ndarray) -> np.ndarray:
     return light.reshape(len(light), -1, HALF).sum(axis=2)[:, PAD:-PAD]
 
 
-def _growth(scene: WildScene, mine: Elements) -> np.ndarray:
-    """``[S]`` growth of the path for a path that grows by 1 as seen from the wall's middle."""
+def _away(scene: WildScene, mine: Elements) -> np.ndarray:
+    """Unit vector from the wall's middle to a patch."""
     centre = mine.area @ mine.centre / mine.area.sum()
     middle = (scene.sensor.min(axis=0) + scene.sensor.max(axis=0)) / 2
-    away = (centre - middle) / np.linalg.norm(centre - middle)
+    return (centre - middle) / np.linalg.norm(centre - middle)
+
+
+def _growth(scene: WildScene, mine: Elements) -> np.ndarray:
+    """``[S]`` growth of the path for a path that grows by 1 as seen from the wall's middle."""
+    centre, away = mine.area @ mine.centre / mine.area.sum(), _away(scene, mine)
     legs = (centre - points for points in (scene.laser, scene.sensor))
     return sum((leg / np.linalg.norm(leg, axis=1, keepdims=True)) @ away for leg in legs) / 2
 
 
-def _width_changes(truth: Truth, scene: WildScene, signal: np.ndarray) -> list[np.ndarray]:
+def _width_changes(scene: WildScene, widths: tuple[float, float], signal: np.ndarray) -> list[np.ndarray]:
     """Of the whole scene's light, by σ and by κ."""
-    light = scene.clean.reshape(len(scene.clean), -1, 8 // HALF).sum(axis=2)
+    light = scene.clean.reshape(len(scene.clean), -1, FINE // HALF).sum(axis=2)
     light = light * (signal.sum() / light.sum())
-    sigma, kappa = _widths(truth)
+    sigma, kappa = widths
     step = scene.window.bin_length / HALF
     changes = []
     for more in ((np.exp(0.1), 1.0), (1.0, np.exp(0.1))):
