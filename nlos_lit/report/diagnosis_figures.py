@@ -10,16 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 
-from nlos_lit.inference.result import Accepted, Diagnosis, Profile, Screened
-from nlos_lit.report.quantities import number, percent, plus_minus, scales, scales_of
+from nlos_lit.inference.result import Accepted, Diagnosis, Profile, Screened, Shape
+from nlos_lit.report.quantities import amount_of, number, percent, plus_minus, scales, scales_of
 from nlos_lit.report.style import (
     BLACK,
     BLUE,
     GREEN,
     NOTHING,
     ORANGE,
+    PINK,
     RED,
     SIGNED,
     SKY,
@@ -36,10 +37,12 @@ LABELS = {
     "scan": "scan order",
     "rate": "count rate",
     "wall": "place on the wall",
+    "spot": "spot, in scan order",
 }
 BY_CHANCE = 0.0027  # share of a normal distribution beyond ±3σ
-SEEN = 25.0  # statistic at which an effect counts as visible
+MANY = 300  # values from which on a free term is drawn as dots
 GREY = "#8c8c8c"
+PALE_PINK = "#e9c6db"
 
 
 def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
@@ -51,12 +54,16 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         name += f"_{sum(other.startswith(name) for other in shown) + 1}" if name in shown else ""
         flat = profile.edges_y is None
         shown[name] = residual_profile(profile, bin_length) if flat else residual_wall(profile)
+    for term in diagnosis.unknown:
+        if term.shape is not None:
+            shown[f"unknown_{term.name}"] = free_shape(term.name, term.shape, bin_length)
     shown["deviance"] = deviance_steps(diagnosis)
-    if any(effect.parameters for effect in diagnosis.effects):
-        shown["effects"] = accepted_effects(diagnosis.effects, bin_length)
+    terms = [*diagnosis.effects, *diagnosis.unknown]
+    if any(term.parameters for term in terms):
+        shown["effects"] = accepted_effects(terms, bin_length)
     if diagnosis.screened:
         shown["screening"] = screening_ranking(
-            diagnosis.screened, [effect.name for effect in diagnosis.effects]
+            diagnosis.screened, diagnosis.needed, [term.name for term in terms]
         )
     if any(s.detectable for s in diagnosis.screened):
         shown["detection_limits"] = detection_limits(diagnosis.screened, bin_length)
@@ -140,23 +147,76 @@ def residual_wall(profile: Profile) -> Figure:
 
 
 @styled
-def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()) -> Figure:
-    """Score statistic of every effect, ranked by predicted gain.
+def free_shape(name: str, shape: Shape, bin_length: float | None = None) -> Figure:
+    """What a free term does along its axis, or over two: a change in percent, or a delay; no change at 0.
+
+    Args:
+        name: of the term.
+        shape: of it.
+        bin_length: m; where it is known, delays are told in bins.
+
+    Returns:
+        One panel.
+    """
+    values, label = _change(name, shape, bin_length)
+    if shape.edges_y is None:
+        figure = Figure(figsize=(7.5, 3.0))
+        axes = figure.subplots()
+        axes.axhline(0, color=BLACK, linewidth=0.6)
+        if len(values) > MANY:
+            centres = (shape.edges[:-1] + shape.edges[1:]) / 2
+            axes.plot(centres, values, ".", color=PINK, markersize=2)
+        else:
+            axes.stairs(values, shape.edges, fill=True, color=PINK, alpha=0.35, linewidth=0)
+            axes.stairs(values, shape.edges, baseline=None, color=PINK, linewidth=1.1)
+        axes.set(xlim=shape.edges[[0, -1]], xlabel=_along(shape.axis), ylabel=label)
+        axes.margins(y=0.1)
+        if shape.axis == "rate" and shape.edges[0] > 0:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
+        if shape.axis == "time" and bin_length:
+            upper_time_axis(axes, bin_length, 1e9, "time since the start of bin 0 (ns)")
+    else:
+        known = np.abs(values[np.isfinite(values)])
+        limit = (float(np.quantile(known, 0.99)) if known.size else 0.0) or 1.0
+        scale: dict[str, Any] = {"cmap": SIGNED, "norm": Normalize(-limit, limit)}
+        first, _, second = shape.axis.partition("×")
+        high = np.ptp(shape.edges_y) / np.ptp(shape.edges)
+        figure = Figure(figsize=(7.5, 3.6) if second else (5.2, min(7.0, max(3.4, 1.1 + 3.6 * high))))
+        axes = figure.subplots()
+        if second:
+            mesh = axes.pcolormesh(shape.edges, shape.edges_y, np.ma.masked_invalid(values).T, **scale)
+            axes.set(xlabel=_along(first), ylabel=_along(second), facecolor=NOTHING)
+        else:
+            mesh = _map(axes, values, shape.edges, shape.edges_y, **scale)
+            axes.set(xlabel="x (m)", ylabel="y (m)")
+        colour_bar(mesh, f"{label}, 99 % inside")
+    axes.set_title(describe(name).phrase, loc="left")
+    return figure
+
+
+@styled
+def screening_ranking(screened: Sequence[Screened], needed: float, accepted: Sequence[str] = ()) -> Figure:
+    """Evidence of every effect and free term, the most first.
 
     Args:
         screened: grey and hatched where an effect can hardly be told from the scene.
-        accepted: names of effects that are ticked.
+        needed: nats, a line.
+        accepted: names that are ticked.
 
     Returns:
-        One panel, a bar for each effect.
+        One panel, a bar for each.
     """
-    ranked = by_gain(screened)
-    figure = Figure(figsize=(8, 1.3 + 0.27 * len(ranked)))
+    ranked = by_evidence(screened)
+    figure = Figure(figsize=(8, 1.4 + 0.27 * len(ranked)))
     axes = figure.subplots()
-    largest = max([s.statistic for s in ranked if np.isfinite(s.statistic)] + [100.0])
+    largest = max([s.evidence for s in ranked if np.isfinite(s.evidence)] + [needed, 10.0])
     for row, one in enumerate(ranked):
-        hard, length = barely(one), one.statistic if one.statistic > 1 else 1.0  # NaN: no bar
-        colour = NOTHING if hard else BLUE if one.name in accepted else SKY
+        hard, length = barely(one), one.evidence if one.evidence > 1 else 1.0  # NaN: no bar
+        deep, pale = (PINK, PALE_PINK) if describe(one.name).free else (BLUE, SKY)
+        colour = NOTHING if hard else deep if one.name in accepted else pale
         axes.barh(
             row,
             length - 1,
@@ -167,23 +227,27 @@ def screening_ranking(screened: Sequence[Screened], accepted: Sequence[str] = ()
             edgecolor=GREY,
             linewidth=0.6,
         )
-        axes.plot([max(one.expected, 1)] * 2, (row - 0.36, row + 0.36), color=BLACK, linewidth=1.6)
-        kept, gain = percent(one.retained_information), number(one.predicted_gain)
-        text = f"{number(one.statistic)}   keeps {kept}, gain {gain} nats"
-        place = max(length, one.expected) * largest**0.015
+        text = f"{number(one.evidence)}   keeps {percent(one.retained_information)}"
         box = {"facecolor": "white", "edgecolor": "none", "pad": 0.5}
-        axes.text(place, row, text, va="center", fontsize="small", color=GREY if hard else BLACK, bbox=box)
-    axes.axvline(SEEN, color=ORANGE, linestyle="--", linewidth=1)
+        axes.text(
+            length * largest**0.015,
+            row,
+            text,
+            va="center",
+            fontsize="small",
+            color=GREY if hard else BLACK,
+            bbox=box,
+        )
+    axes.axvline(needed, color=ORANGE, linestyle="--", linewidth=1)
     names = [one.name + (" ✔" if one.name in accepted else "") for one in ranked]
     axes.set_yticks(range(len(ranked)), labels=names)
-    axes.set(
-        xscale="log", xlim=(1, largest**1.75), ylim=(len(ranked) - 0.4, -0.6), xlabel="score statistic (χ²)"
-    )
-    axes.set_xticks([10.0**k for k in range(int(np.log10(largest)) + 1)])
+    axes.set(xscale="log", xlim=(1, largest**1.4), ylim=(len(ranked) - 0.4, -0.6), xlabel="evidence (nats)")
+    ticks = [10**k for k in range(int(np.log10(largest)) + 1)]
+    axes.set_xticks(ticks, labels=[f"{tick:,}" for tick in ticks])
     axes.minorticks_off()
     axes.set_title(
-        "black tick: expected without the effect; dashed: counts as visible;\n"
-        "hatched: barely identifiable here",
+        f"blue: known effects; pink: free terms; dark: accepted;\n"
+        f"dashed: needed ({number(needed)} nats); hatched: barely identifiable here",
         loc="left",
     )
     return figure
@@ -194,7 +258,7 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
     """Each parameter with its 95 % interval, against the value that means "absent" (dashed).
 
     Args:
-        effects: that were accepted.
+        effects: that were accepted, or free terms.
         bin_length: m, where known.
 
     Returns:
@@ -205,7 +269,8 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
     for axes, (effect, name, p) in zip(figure.subplots(len(rows), 1, squeeze=False)[:, 0], rows, strict=True):
         factor, unit = scales(effect, name, p.unit, p.value, bin_length)[0]
         value, half = factor * p.value, 1.96 * factor * p.stderr
-        axes.errorbar(value, 0, xerr=half if np.isfinite(half) else None, fmt="o", color=BLUE, capsize=3)
+        colour, xerr = PINK if describe(effect).free else BLUE, half if np.isfinite(half) else None
+        axes.errorbar(value, 0, xerr=xerr, fmt="o", color=colour, capsize=3)
         null = describe(effect).null_of(name)
         ends = [value] + ([value - half, value + half] if np.isfinite(half) else [])
         if null is not None:
@@ -226,17 +291,22 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
 
 @styled
 def deviance_steps(diagnosis: Diagnosis) -> Figure:
-    """Deviance per bin after each accepted effect, and on the untouched spots; grey: counting noise."""
+    """Deviance per bin after each accepted term, and on the untouched spots; grey: counting noise."""
     base, extended, test = diagnosis.base, diagnosis.extended, diagnosis.untouched_test
     steps = [("base", base.deviance_per_bin)]
-    steps += [(f"+ {e.name}", e.heldout_gain.deviance_per_bin_after) for e in diagnosis.effects]
-    steps += [("all together", extended.deviance_per_bin)] if diagnosis.effects else []
+    terms = sorted(
+        [*diagnosis.effects, *diagnosis.unknown],
+        key=lambda t: np.nan_to_num(t.heldout_gain.deviance_per_bin_before),
+        reverse=True,
+    )
+    steps += [(f"+ {t.name}", t.heldout_gain.deviance_per_bin_after) for t in terms]
+    steps += [("all together", extended.deviance_per_bin)] if terms else []
     figure = Figure(figsize=(max(5.0, 1.1 * (len(steps) + 3)), 3.6))
     axes = figure.subplots()
     last = extended.deviance_noise if np.isfinite(extended.deviance_noise) else base.deviance_noise
     groups: list[tuple[float, list[tuple[str, float]], np.ndarray, str, str]]
     groups = [(0, steps, np.linspace(base.deviance_noise, last, len(steps)), BLUE, "held-out spots")]
-    names = [n for n in ("base", "extended") if n in test and (n == "base" or diagnosis.effects)]
+    names = [n for n in ("base", "extended") if n in test and (n == "base" or terms)]
     scored = [(f"untouched:\n{n}", test[n].deviance_per_bin) for n in names]
     groups += (
         [
@@ -349,7 +419,7 @@ def detection_limits(screened: Sequence[Screened], bin_length: float | None = No
         axes.set_yticks(range(len(rows)), labels=[name for name, *_ in rows])
         axes.set(xscale="log", xlim=(low, high), ylim=(len(rows) - 0.5, -0.5), xlabel=unit)
         axes.xaxis.set_minor_formatter(NullFormatter())
-    figure.suptitle("smallest strength that would have been seen", fontsize="medium")
+    figure.suptitle("smallest strength that would be named in nine of ten cases", fontsize="medium")
     return figure
 
 
@@ -436,11 +506,24 @@ def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
     return figure
 
 
-def by_gain(screened: Sequence[Screened]) -> list[Screened]:
-    """Best predicted gain first, unknown ones last."""
-    return sorted(
-        screened, key=lambda s: s.predicted_gain if np.isfinite(s.predicted_gain) else -np.inf, reverse=True
-    )
+def by_evidence(screened: Sequence[Screened]) -> list[Screened]:
+    """Most evidence first, unknown ones last."""
+    return sorted(screened, key=lambda s: s.evidence if np.isfinite(s.evidence) else -np.inf, reverse=True)
+
+
+def _along(axis: str) -> str:
+    """What stands at an axis of a free term's shape."""
+    return {"rate": "counts of a spot", "wall": "place on the wall (m)"}.get(axis) or LABELS.get(axis, axis)
+
+
+def _change(name: str, shape: Shape, bin_length: float | None) -> tuple[np.ndarray, str]:
+    """A free term's values as they are shown, and what they are."""
+    if shape.unit == "1":
+        what = "background" if "background" in name else "counts"
+        return 100 * np.expm1(shape.values), f"change of the {what} (%)"
+    if bin_length:
+        return shape.values / bin_length, f"delay (bins of {amount_of('length', bin_length)})"
+    return 1e3 * shape.values, "delay (mm of path)"
 
 
 def _panels(profile: Profile) -> dict[str, np.ndarray]:

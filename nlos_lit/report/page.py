@@ -15,19 +15,20 @@ from torch.utils.tensorboard import SummaryWriter
 
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.io.files import whole_file, write_json
-from nlos_lit.report.diagnosis_figures import by_gain, diagnosis_figures
+from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
 from nlos_lit.report.page_style import CSS
-from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, probability, quantity
+from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, quantity
 from nlos_lit.report.style import save_figure
 from nlos_lit.report.verdict import (
     barely,
-    indistinguishable,
     invisible,
     misfit,
     missing,
+    rivals,
     sureness,
     tone,
     verdict,
+    weight_of,
 )
 from nlos_lit.report.words import AXES, describe
 
@@ -38,15 +39,17 @@ CAPTIONS = {
     "residual_wall": "Residual over the wall, as seen from the wall.",
     "residual_scan": "Residual in the order in which the spots were recorded.",
     "residual_rate": "Residual against how bright a spot is.",
-    "deviance": "Misfit after each accepted effect, and on spots that nothing was chosen with. Grey: only"
-    " counting noise is left.",
-    "effects": "Parameters of the accepted effects.",
-    "screening": "What every known effect would explain by itself, before any was accepted.",
-    "detection_limits": "How strong each effect would have to be to show in this capture.",
+    "deviance": "Misfit after each accepted effect or free term, and on spots that nothing was chosen with."
+    " Grey: only counting noise is left.",
+    "effects": "Parameters of the accepted effects and free terms.",
+    "screening": "How much the counts ask for every known effect and free term by itself, before any was"
+    " accepted.",
+    "detection_limits": "How strong each would have to be to be named in nine of ten cases.",
     "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted"
     " inside it.",
     "witness_tail": "The direct pulse's own decay against the tail that was fitted inside the gate.",
 }
+SCATTERED = 1.5  # scatter from which on it is said
 FACTS = {
     "bin_width_ps": "bin width (ps)",
     "bin_length": "bin length (m of path)",
@@ -129,15 +132,17 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         f'<h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis, listed=False))}</h1>{each}'
         f"<p>{_text(sureness(diagnosis))}</p></header>",
         _misfit_bar(diagnosis),
-        _section("What the simulation was extended with", _accepted(diagnosis)) if diagnosis.effects else "",
+        _section("What the simulation was extended with", _accepted(diagnosis, diagnosis.effects))
+        if diagnosis.effects
+        else "",
+        _section("What no known effect explains", _unexplained(diagnosis) + shown("unknown_")),
         _section("Why, and what to do on the rig", _remedies(diagnosis))
-        if diagnosis.effects or diagnosis.groups
+        if diagnosis.effects or diagnosis.unknown
         else "",
         _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
-        _section("What stays unexplained", _unexplained(diagnosis)),
         _section("Where simulation and measurement differ", shown("residual_")),
         _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
-        _section("Every known effect, tested", shown("screening") + _screened(diagnosis))
+        _section("Every known effect and free term, tested", shown("screening") + _screened(diagnosis))
         if diagnosis.screened
         else "",
         _section("What could not have been seen", _limits(diagnosis) + shown("detection_limits"))
@@ -146,7 +151,6 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         _section("The direct pulse as witness", _witness(diagnosis) + shown("witness_"))
         if diagnosis.witness
         else "",
-        _section("Numerics, not physics", _numerics(diagnosis)) if diagnosis.numerics else "",
         _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
         if diagnosis.notes
         else "",
@@ -166,7 +170,7 @@ def _misfit_bar(diagnosis: Diagnosis) -> str:
     m = misfit(diagnosis)
     parts = {
         "noise": ("counting noise", m.noise),
-        "explained": ("explained", m.explained),
+        "explained": ("explained, by free terms too" if diagnosis.unknown else "explained", m.explained),
         "unexplained": ("unexplained", m.unexplained),
     }
     total = sum(value for _, value in parts.values())
@@ -187,16 +191,15 @@ def _misfit_bar(diagnosis: Diagnosis) -> str:
     return f'<figure><div class="bar">{strip}</div><div class="keys">{keys}</div>{caption}</figure>'
 
 
-def _accepted(diagnosis: Diagnosis) -> str:
+def _accepted(diagnosis: Diagnosis, terms: Iterable[Accepted]) -> str:
     heads = [
         "Effect",
         "Size (± standard error)",
-        "Statistic",
-        "p",
-        "Gain on held-out blocks",
-        "May be confused with",
+        "Evidence (nats)",
+        "Gain on other spots",
+        "May be instead",
     ]
-    return _table(heads, [_accepted_row(diagnosis, effect) for effect in diagnosis.effects], "cards")
+    return _table(heads, [_accepted_row(diagnosis, term) for term in terms], "cards")
 
 
 def _accepted_row(diagnosis: Diagnosis, effect: Accepted) -> list[Any]:
@@ -214,18 +217,22 @@ def _accepted_row(diagnosis: Diagnosis, effect: Accepted) -> list[Any]:
         f"<div>deviance per bin {number(gain.deviance_per_bin_before, 4)} →"
         f" {number(gain.deviance_per_bin_after, 4)}</div>"
     )
-    others = list(dict.fromkeys([*indistinguishable(diagnosis, effect.name), *effect.confusable_with]))
-    confused = f"{_text(', '.join(others) or 'nothing')}" + (
+    others = [f"{name}{weight_of(weight)}" for name, weight in rivals(diagnosis, effect).items()]
+    confused = f"{_text(', '.join(others) or 'nothing else')}" + (
         f"<div><small>split by: {_text(effect.split_by)}</small></div>" if effect.split_by else ""
     )
     title = f"<b>{_text(describe(effect.name).phrase)}</b> <small>{_text(effect.name)}</small>"
-    numbers = [number(effect.statistic), probability(effect.p_value)]
-    return [Markup(title), Markup("".join(sizes) or NONE), *numbers, Markup(held), Markup(confused)]
+    size = Markup("".join(sizes) or NONE)
+    return [Markup(title), size, number(effect.evidence), Markup(held), Markup(confused)]
 
 
 def _remedies(diagnosis: Diagnosis) -> str:
     names = dict.fromkeys(
-        [*(e.name for e in diagnosis.effects), *(n for group in diagnosis.groups for n in group)]
+        [
+            name
+            for term in [*diagnosis.effects, *diagnosis.unknown]
+            for name in [term.name, *rivals(diagnosis, term)]
+        ]
     )
     words = [(describe(n).words, n) for n in names]
     return (
@@ -242,17 +249,26 @@ def _remedies(diagnosis: Diagnosis) -> str:
 def _groups(diagnosis: Diagnosis) -> str:
     items = []
     for group in diagnosis.groups:
-        splits = [e.split_by for e in diagnosis.effects if e.name in group and e.split_by]
+        terms = [t for t in [*diagnosis.effects, *diagnosis.unknown] if t.name in group]
+        splits = [t.split_by for t in terms if t.split_by]
         how = f" – split by: {'; '.join(dict.fromkeys(splits))}" if splits else ""
-        items.append(f"<li>{_text(' or '.join(f'{describe(n).phrase} ({n})' for n in group) + how)}</li>")
+        names = " or ".join(f"{describe(name).phrase} ({name})" for name in group)
+        items.append(f"<li>{_text(names + how)}</li>")
     return f"<p>These leave nearly the same trace in this capture.</p><ul>{''.join(items)}</ul>"
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
     left = diagnosis.unexplained
-    axis = AXES.get(left.axis, left.axis) or "on any axis"
-    what = f"Significant, {axis}" if left.significant else f"Nothing significant; the largest rest is {axis}"
-    return f"<p>{_text(what)}: statistic {number(left.statistic)}, p = {probability(left.p_value)}.</p>"
+    held = (
+        f"{AXES.get(left.axis, left.axis)}: {number(left.evidence)} nats, {number(diagnosis.needed)} needed"
+    )
+    if not diagnosis.unknown:
+        return f"<p>{_text(f'No free term is needed. The most evidence of one is {held}.')}</p>"
+    what = (
+        "A free term is a correction without a name, of any form along its axis."
+        f" The most evidence is {held}."
+    )
+    return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown)
 
 
 def _scores(diagnosis: Diagnosis) -> str:
@@ -269,9 +285,9 @@ def _scores(diagnosis: Diagnosis) -> str:
 
 
 def _screened(diagnosis: Diagnosis) -> str:
-    bin_length, accepted = diagnosis.capture.get("bin_length"), {e.name for e in diagnosis.effects}
-    rows = []
-    for one in by_gain(diagnosis.screened):
+    bin_length, rows = diagnosis.capture.get("bin_length"), []
+    accepted = {term.name for term in [*diagnosis.effects, *diagnosis.unknown]}
+    for one in by_evidence(diagnosis.screened):
         step = {**one.one_step, **one.shape}
         sizes = ", ".join(
             f"{n.replace('_', ' ')} {amount(one.name, n, v, bin_length)}" for n, v in step.items()
@@ -284,31 +300,22 @@ def _screened(diagnosis: Diagnosis) -> str:
         rows.append(
             [
                 title,
-                number(one.statistic),
-                one.degrees,
-                probability(one.p_value),
+                number(one.evidence),
                 kept,
-                number(one.predicted_gain),
+                number(one.scatter, 2) if one.scatter > SCATTERED else "",
+                one.degrees,
                 sizes or NONE,
             ]
         )
-    heads = [
-        "Effect",
-        "Statistic",
-        "Parameters",
-        "p",
-        "Retained information",
-        "Predicted gain (nats)",
-        "First estimate",
-    ]
-    kept = "what is left of an effect's trace once scene, albedo and response have adapted"
-    rule = (
-        "A small p alone is not enough:"
-        " an accepted effect also gains on held-out blocks, and beats its rivals."
+    heads = ["Effect", "Evidence (nats)", "Retained", "Scatter", "Coefficients", "First estimate"]
+    text = (
+        f"Ranked by evidence, of which {number(diagnosis.needed)} nats are needed; ✔ accepted. Evidence alone"
+        " is not enough: what is accepted also gains on other spots, and beats its rivals. Evidence:"
+        " logarithm of the odds that the counts give to the term against none. Retained: what is left of its"
+        " trace once scene, albedo and response have adapted. Scatter: how much more its trace varies over"
+        f" the wall than counts do, where that is more than {SCATTERED}."
     )
-    return f"<p>Ranked by predicted gain. ✔ accepted. {rule} Retained information: {kept}.</p>" + _table(
-        heads, rows
-    )
+    return f"<p>{_text(text)}</p>" + _table(heads, rows)
 
 
 def _limits(diagnosis: Diagnosis) -> str:
@@ -323,7 +330,7 @@ def _limits(diagnosis: Diagnosis) -> str:
             else ""
         )
         rows.append([one.name, "at no possible strength" if invisible(one) else limits or NONE, remark])
-    return _table(["Effect", "Would have been seen from", "Remark"], rows)
+    return _table(["Effect", "Would be named in nine of ten cases from", "Remark"], rows)
 
 
 def _witness(diagnosis: Diagnosis) -> str:
@@ -347,12 +354,6 @@ def _witness(diagnosis: Diagnosis) -> str:
             ]
         )
     return "<p>It lies outside the gate; no fit has used it.</p>" + _table(["Witness", "Value"], rows)
-
-
-def _numerics(diagnosis: Diagnosis) -> str:
-    rows = [[name.replace("_", " "), number(value)] for name, value in diagnosis.numerics.items()]
-    heads = ["Varied", "Change of the deviance per bin (held-out spots)"]
-    return "<p>What moves when only the computation is varied is not physics.</p>" + _table(heads, rows)
 
 
 def _facts(diagnosis: Diagnosis) -> str:
@@ -381,7 +382,12 @@ def _table(heads: list[str], rows: Iterable[list[Any]], style: str = "") -> str:
 
 
 def _image(name: str, png: bytes) -> Markup:
-    base = CAPTIONS.get(name) or CAPTIONS.get(re.sub(r"_\d+$", "", name)) or name.replace("_", " ")
+    term = name.removeprefix("unknown_")
+    base = (
+        f"The free term {term}: {describe(term).phrase}; 0 is no change."
+        if term != name
+        else CAPTIONS.get(name) or CAPTIONS.get(re.sub(r"_\d+$", "", name)) or name.replace("_", " ")
+    )
     data = base64.b64encode(png).decode("ascii")
     return Markup(
         f'<figure><img alt="{_text(base)}" src="data:image/png;base64,{data}">'

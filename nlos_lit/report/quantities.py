@@ -70,8 +70,18 @@ def percent(share: float | None, digits: int = 2) -> str:
 
 
 def probability(p: float | None) -> str:
-    """A p-value; one too small for a float is said to be so."""
-    return "< 10⁻³⁰⁰" if p is not None and 0 <= p < 1e-300 else number(p, 2)
+    """A chance to two digits, never said smaller than it is; one too small for a float is said to be so.
+
+    Examples:
+        >>> probability(1 / 99), probability(0.25), probability(0.0)
+        ('0.011', '0.25', '< 10⁻³⁰⁰')
+    """
+    if p is None or not math.isfinite(p):
+        return NONE
+    if p < 1e-300:
+        return "< 10⁻³⁰⁰"
+    step = 10.0 ** (math.floor(math.log10(p)) - 1)
+    return number(math.ceil(p / step - 1e-9) * step, 2)
 
 
 def plus_minus(value: float, stderr: float) -> str:

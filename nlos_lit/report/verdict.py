@@ -1,12 +1,13 @@
-"""The diagnosis in one sentence, and how much of the misfit it explains."""
+"""The diagnosis in a few sentences, and how much of the misfit it explains."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from nlos_lit.inference.result import Accepted, Diagnosis, Scores, Screened
-from nlos_lit.report.quantities import headline, percent, probability
+from nlos_lit.report.quantities import headline, number, percent, probability
 from nlos_lit.report.words import AXES, describe
 
 AT_NOISE = 0.03  # excess over counting noise that is called "at the noise"
@@ -46,21 +47,19 @@ def misfit(diagnosis: Diagnosis) -> Misfit:
     return Misfit(base.deviance_noise, before - left, left, 1 - after / before, untouched)
 
 
-def indistinguishable(diagnosis: Diagnosis, name: str) -> list[str]:
-    """Effects that this capture cannot tell apart from one.
+def rivals(diagnosis: Diagnosis, term: Accepted) -> dict[str, float | None]:
+    """What this capture leaves open instead of a term.
 
     Args:
-        diagnosis: with groups of such effects.
-        name: of the one.
+        diagnosis: with groups of names that cannot be told apart.
+        term: that was accepted.
 
     Returns:
-        Names, each once, in the order of the groups.
+        Weights by name, the largest first, None where a name has none; without the term itself.
     """
-    return list(
-        dict.fromkeys(
-            other for group in diagnosis.groups if name in group for other in group if other != name
-        )
-    )
+    weighed = sorted(term.confusable_with, key=lambda name: -term.weights[name])
+    grouped = [name for group in diagnosis.groups if term.name in group for name in group]
+    return {name: term.weights.get(name) for name in [*weighed, *grouped] if name != term.name}
 
 
 def barely(screened: Screened) -> bool:
@@ -76,101 +75,159 @@ def invisible(screened: Screened) -> bool:
 
 def tone(diagnosis: Diagnosis) -> str:
     """``fine``, ``found`` or ``unexplained``."""
-    if diagnosis.unexplained.significant:
+    if diagnosis.unknown:
         return "unexplained"
-    return "found" if diagnosis.effects or diagnosis.groups else "fine"
+    return "found" if diagnosis.effects else "fine"
 
 
 def missing(diagnosis: Diagnosis) -> list[str]:
-    """What the simulation misses, in plain words: each effect, and each group without an accepted one."""
-    names = {effect.name for effect in diagnosis.effects}
-    found = [_one(diagnosis, effect) for effect in diagnosis.effects]
-    for group in diagnosis.groups:
-        if not names & set(group):
-            found.append(f"one of these, and this capture cannot tell which: {_either(group)}")
-    return found
+    """What the simulation misses, in plain words: each effect, with what it may be instead."""
+    return [_one(diagnosis, effect) for effect in diagnosis.effects]
 
 
 def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
-    """What is wrong, in plain words and one or two sentences.
+    """What is wrong, in plain words and a few sentences.
 
     Args:
         diagnosis: the whole.
         listed: say each of several things; else they are only counted.
 
     Returns:
-        What is missing, how much of the misfit it explains, and whether something else is wrong.
+        What is missing, whether something else is wrong, and how much of the misfit all that explains.
     """
-    found = missing(diagnosis)
-    axis = AXES.get(diagnosis.unexplained.axis, "on some axis")
+    found, share = missing(diagnosis), misfit(diagnosis).share
+    said = "" if share is None else f"{percent(min(share, 1.0))} of the excess misfit"
     if not found:
-        return (
-            f"Something is wrong {axis} that no known effect explains."
-            if diagnosis.unexplained.significant
-            else _nothing(diagnosis)
-        )
+        if not diagnosis.unknown:
+            return _nothing(diagnosis)
+        holds = f" {_free_terms(diagnosis, said)}." if said else ""
+        return f"{_wrong(diagnosis, 'Something')}.{holds}"
     if len(found) == 1:
         text = f"Your simulation misses {found[0]}"
     else:
         every = ": " + "; ".join(f"({k}) {one}" for k, one in enumerate(found, 1))
         text = f"Your simulation misses {len(found)} things{every if listed else ''}"
-    share = misfit(diagnosis).share
-    if diagnosis.effects and share is not None:
-        what = "it" if len(diagnosis.effects) == 1 else "them"
-        text += f"; modelling {what} explains {percent(min(share, 1.0))} of the excess misfit"
-    more = (
-        f" Something is still wrong {axis} that no known effect explains."
-        if diagnosis.unexplained.significant
-        else ""
-    )
-    return text + "." + more
+    if not diagnosis.unknown:
+        what = "it" if len(found) == 1 else "them"
+        return f"{text}; modelling {what} explains {said}." if said else f"{text}."
+    text += f". {_wrong(diagnosis, 'Something else')}"
+    held = _held(diagnosis)
+    if held is not None:
+        sentence = _free_terms(diagnosis, f"{percent(held)} of the excess misfit")
+        text += f"; {sentence[0].lower()}{sentence[1:]}"
+    return f"{text}. Modelling all of them explains {said}." if said else f"{text}."
 
 
 def sureness(diagnosis: Diagnosis) -> str:
-    """How far the verdict can be trusted, in one or two sentences."""
-    parts = []
-    if diagnosis.effects:
-        several = len(diagnosis.effects) > 1
-        known = [e.p_value for e in diagnosis.effects if math.isfinite(e.p_value)]
-        if known:
-            what = "any one of these effects" if several else "this effect"
-            parts.append(f"The chance that noise alone would look like {what} is {probability(max(known))}.")
-        sure = sum(e.heldout_gain.ci95[0] > 0 for e in diagnosis.effects)
-        gain = (
-            "The gain"
-            if sure == len(diagnosis.effects)
-            else f"The gain of {sure} of {len(diagnosis.effects)} effects"
-        )
+    """How far the verdict can be trusted, in a few sentences."""
+    terms = [*diagnosis.effects, *diagnosis.unknown]
+    parts = [_evidence(diagnosis, terms)]
+    if terms:
+        sure = sum(term.heldout_gain.ci95[0] > 0 for term in terms)
+        gain = "The gain" if sure == len(terms) else f"The gain of {sure} of {len(terms)} terms"
         parts.append(f"{gain} holds on wall blocks that were not fitted (95 % interval above 0).")
-    if diagnosis.unexplained.significant:
-        left = diagnosis.unexplained
+    parts.append(_chance(diagnosis))
+    known = [s for s in diagnosis.screened if not describe(s.name).free]
+    if known:
+        hidden = sum(invisible(s) for s in known)
+        hard = sum(barely(s) and not invisible(s) for s in known)
         parts.append(
-            f"The chance that noise alone leaves what stays unexplained is {probability(left.p_value)}."
-        )
-    if diagnosis.screened:
-        hidden = sum(invisible(s) for s in diagnosis.screened)
-        hard = sum(barely(s) and not invisible(s) for s in diagnosis.screened)
-        parts.append(
-            f"Effects tested: {len(diagnosis.screened)}, of which {hard} barely identifiable in this capture,"
+            f"Effects tested: {len(known)}, of which {hard} barely identifiable in this capture,"
             f" {hidden} not at all."
         )
-    if diagnosis.toys:
-        parts.append(f"What noise alone does was checked on {diagnosis.toys} simulated captures.")
-    else:
-        parts.append("These probabilities are from theory alone: no simulated captures were run.")
-    return " ".join(parts)
+    if len(known) < len(diagnosis.screened):
+        parts.append(f"Free terms tested: {len(diagnosis.screened) - len(known)}.")
+    return " ".join(filter(None, parts))
+
+
+def either(weights: Mapping[str, float | None]) -> str:
+    """Several names as alternatives.
+
+    Args:
+        weights: of each, where there are any.
+
+    Returns:
+        Their phrases.
+
+    Examples:
+        >>> either({"irf_tail": 0.81, "wall_tilt": 0.19})
+        "a slow detector tail (81 %) or a relay wall that is tilted against the scan's plane (19 %)"
+    """
+    return _joined([_with_weight(describe(name).phrase, weight) for name, weight in weights.items()], "or")
+
+
+def weight_of(weight: float | None) -> str:
+    """A weight behind a name; empty where there is none."""
+    return "" if weight is None else f" ({percent(weight, 1)})"
+
+
+def _with_weight(phrase: str, weight: float | None) -> str:
+    """One bracket, where the phrase ends with one."""
+    if weight is None or not phrase.endswith(")"):
+        return phrase + weight_of(weight)
+    return f"{phrase[:-1]}; {percent(weight, 1)})"
 
 
 def _one(diagnosis: Diagnosis, effect: Accepted) -> str:
-    size = headline(effect.name, effect.parameters)
-    text = f"{describe(effect.name).phrase}: {size}" if size else describe(effect.name).phrase
-    others = indistinguishable(diagnosis, effect.name)
-    return f"{text} (or {_either(others)}: this capture cannot tell which)" if others else text
+    size, others = headline(effect.name, effect.parameters), rivals(diagnosis, effect)
+    if not others:
+        return f"{describe(effect.name).phrase}: {size}" if size else describe(effect.name).phrase
+    open_ = either({effect.name: effect.weights.get(effect.name), **others})
+    first = "former" if len(others) == 1 else "first"
+    return f"{open_}: this capture cannot tell which" + (f"; the {first} would be {size}" if size else "")
 
 
-def _either(names: list[str]) -> str:
-    phrases = [describe(name).phrase for name in names]
-    return " or ".join([", ".join(phrases[:-1]), phrases[-1]] if len(phrases) > 1 else phrases)
+def _wrong(diagnosis: Diagnosis, what: str) -> str:
+    """Where free terms were needed, and what each may be instead."""
+    axes = dict.fromkeys(AXES.get(term.axis, f"along {term.axis}") for term in diagnosis.unknown)
+    text = f"{what} is wrong {_joined(list(axes), 'and')} that no known effect explains"
+    others = {name: w for term in diagnosis.unknown for name, w in rivals(diagnosis, term).items()}
+    return text + (f", unless it is {either(others)}: this capture cannot tell" if others else "")
+
+
+def _free_terms(diagnosis: Diagnosis, what: str) -> str:
+    several = len(diagnosis.unknown) > 1
+    return f"{len(diagnosis.unknown)} free terms hold {what}" if several else f"A free term holds {what}"
+
+
+def _held(diagnosis: Diagnosis) -> float | None:
+    """Share of the excess misfit that the free terms hold by themselves; None where that is not known."""
+    excess = _excess(diagnosis.base)
+    gains = [term.heldout_gain for term in diagnosis.unknown]
+    held = sum(gain.deviance_per_bin_before - gain.deviance_per_bin_after for gain in gains)
+    return min(held / excess, 1.0) if excess > 0 and math.isfinite(held) else None
+
+
+def _evidence(diagnosis: Diagnosis, terms: list[Accepted]) -> str:
+    """How much the counts ask for what was found, or for what comes nearest to being found."""
+    needed = f"{number(diagnosis.needed)} are needed"
+    found = [term.evidence for term in terms if math.isfinite(term.evidence)]
+    if found:
+        least = "each of them is at least" if len(terms) > 1 else "it is"
+        return f"The evidence for {least} {number(min(found))} nats; {needed}."
+    asked = [s for s in diagnosis.screened if math.isfinite(s.evidence)]
+    if terms or not asked:
+        return ""
+    most = max(asked, key=lambda s: s.evidence)
+    text = f"The most evidence, {number(most.evidence)} nats, is for {describe(most.name).phrase}; {needed}"
+    return f"{text}, but other spots did not confirm it." if most.evidence > diagnosis.needed else f"{text}."
+
+
+def _chance(diagnosis: Diagnosis) -> str:
+    """How often as much comes up without any effect; counting allows no less than one in toys + 1."""
+    if not math.isfinite(diagnosis.chance):
+        return ""
+    if not diagnosis.toys:
+        level = probability(diagnosis.chance)
+        return f"As much without any effect: by theory, level {level}; no simulated captures were run."
+    share = probability(max(diagnosis.chance, 1 / (diagnosis.toys + 1)))
+    return (
+        f"Of {diagnosis.toys} simulated captures without any effect, at most a share of {share} gave as much."
+    )
+
+
+def _joined(parts: list[str], word: str) -> str:
+    return f" {word} ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
 def _nothing(diagnosis: Diagnosis) -> str:

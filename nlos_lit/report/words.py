@@ -1,4 +1,4 @@
-"""Effects in plain words, by their names; what a residual lies along, likewise."""
+"""Effects and free terms in plain words, by their names; what a residual lies along, likewise."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.free_terms import FREE
 from nlos_lit.effects.nominal import numbers_of
 from nlos_lit.effects.parameter import Number
 from nlos_lit.effects.words import EffectWords
@@ -16,21 +17,27 @@ AXES = {
     "wall": "across the wall",
     "scan": "over the course of the scan",
     "rate": "with the count rate",
+    "time×scan": "along the time axis, differently over the course of the scan",
+    "time×wall": "along the time axis, differently across the wall",
+    "spot": "from spot to spot",
 }
 PLAIN = Number("1")
+FREE_TERMS = {term.name: term for term in FREE}
 
 
 @dataclass(frozen=True)
 class Description:
-    """What the report knows of an effect.
+    """What the report knows of an effect or a free term.
 
     Args:
         words: in which it is told.
         numbers: its parameters and reported quantities.
+        free: it is a free term.
     """
 
     words: EffectWords
     numbers: Mapping[str, Number] = field(default_factory=dict)
+    free: bool = False
 
     @property
     def phrase(self) -> str:
@@ -52,7 +59,7 @@ class Description:
 
 
 def describe(name: str) -> Description:
-    """Words and numbers of an effect; one that has no words is called by its name.
+    """Words and numbers of an effect or a free term; one that has no words is called by its name.
 
     Examples:
         >>> describe("irf_tail").phrase
@@ -61,7 +68,9 @@ def describe(name: str) -> Description:
         ('time', 0.0)
         >>> describe("dust_cloud").phrase
         'dust cloud'
+        >>> describe("free_wall").phrase, describe("free_wall").free
+        ('something unknown across the wall', True)
     """
-    effect = EFFECTS.named(name)
+    effect = EFFECTS.named(name) or FREE_TERMS.get(name)
     words = (effect.words if effect else None) or EffectWords(name.replace("_", " "))
-    return Description(words, numbers_of(effect) if effect else {})
+    return Description(words, numbers_of(effect) if effect else {}, name in FREE_TERMS)

@@ -14,12 +14,25 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 import torch
-from report_cases import CASES, NAN, TAIL, TILT, diagnosis, two_found
+from report_cases import (
+    CASES,
+    FREE_NAMES,
+    NAN,
+    TAIL,
+    TAIL_ALONE,
+    TILT,
+    UNKNOWN,
+    diagnosis,
+    free,
+    screened,
+    two_found,
+)
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
-from nlos_lit.inference.result import Accepted, Estimate, Gain, Scores, Unexplained
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.result import Accepted, Estimate, Gain, Scores, Screened
 from nlos_lit.report import diagnosis_figures as plots
 from nlos_lit.report.page import report_html, write_report
 from nlos_lit.report.quantities import (
@@ -27,12 +40,13 @@ from nlos_lit.report.quantities import (
     amount,
     headline,
     number,
+    percent,
     plus_minus,
     probability,
     quantity,
 )
-from nlos_lit.report.verdict import misfit, sureness, verdict
-from nlos_lit.report.words import describe
+from nlos_lit.report.verdict import misfit, rivals, sureness, tone, verdict
+from nlos_lit.report.words import AXES, describe
 
 
 class Page(HTMLParser):
@@ -95,6 +109,7 @@ def test_json_is_the_diagnosis(written, case):
     assert set(read) == {
         *(
             "effects",
+            "unknown",
             "groups",
             "unexplained",
             "screened",
@@ -104,18 +119,19 @@ def test_json_is_the_diagnosis(written, case):
             "seconds",
             "seed",
         ),
-        *("witness", "profiles", "numerics", "notes", "capture", "toys"),
+        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys"),
     }
-    assert set(read["unexplained"]) == {"significant", "axis", "statistic", "p_value"}
-    for effect in read["effects"]:
+    assert set(read["unexplained"]) == {"significant", "axis", "evidence"}
+    for effect in [*read["effects"], *read["unknown"]]:
         assert set(effect) == {
             "name",
             "parameters",
-            "statistic",
-            "p_value",
+            "evidence",
             "heldout_gain",
-            "confusable_with",
+            "weights",
             "split_by",
+            "axis",
+            "shape",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
         assert set(effect["heldout_gain"]) == {
@@ -126,7 +142,9 @@ def test_json_is_the_diagnosis(written, case):
         }
         assert len(effect["heldout_gain"]["ci95"]) == 2
     for one in read["screened"]:
-        assert {"name", "statistic", "p_value", "retained_information", "detectable"} <= set(one)
+        assert set(one) == {field.name for field in dataclasses.fields(Screened)}
+    for term in read["unknown"]:
+        assert set(term["shape"]) == {"axis", "unit", "edges", "values", "edges_y"}
 
 
 def test_json_of_values_that_are_not_numbers_is_null(written):
@@ -136,45 +154,102 @@ def test_json_of_values_that_are_not_numbers_is_null(written):
     assert read["profiles"][0]["before"] == [None] * 3
 
 
-def test_verdicts():
-    tail = "Your simulation misses a slow detector tail: 21 ± 2 % of the photons, τ = 0.39 ns"
-    # excess on untouched spots: 1.30 - 0.94 = 0.36 before, 1.03 - 0.93 = 0.10 after, so 72 % explained
-    assert (
-        verdict(two_found(effects=[TAIL], groups=[]))
-        == f"{tail}; modelling it explains 72 % of the excess misfit."
-    )
-    # without untouched spots: (1.2417 - 0.9402) = 0.3015, (1.0351 - 0.9251) = 0.11: 64 %
-    assert "64 % of" in verdict(two_found(effects=[TAIL], groups=[], untouched_test={}))
+def test_the_verdict_where_nothing_is_needed():
     assert verdict(CASES["nothing"]) == "Nothing in the registry is needed: the fit is at the noise."
-    assert (
-        verdict(CASES["unexplained"])
-        == "Something is wrong along the time axis that no known effect explains."
-    )
-    both = verdict(CASES["two"])
-    assert both.startswith("Your simulation misses 2 things: (1) a slow detector tail")
-    assert "41.3 ± 0.9 mrad along x" in both
-    assert verdict(CASES["two"], listed=False).startswith(
-        "Your simulation misses 2 things; modelling them explains"
-    )
-    page = report_html(CASES["two"], {})
-    head = page[page.index("<h1") : page.index("</header>")]
-    assert "mrad" not in head[: head.index("</h1>")]
-    assert head.count("<li>") == 2
-    assert "41.3 ± 0.9 mrad along x" in head
-    assert "<li>" not in report_html(two_found(effects=[TAIL], groups=[]), {}).split("</header>")[0]
-    assert (
-        "(or a time zero that drifts during the scan: this capture cannot tell which); modelling them" in both
-    )
-    group = verdict(diagnosis(groups=[["pile_up", "time_offset"]]))
-    assert group.startswith(
-        "Your simulation misses one of these, and this capture cannot tell which: pile-up"
-    )
-    left = verdict(two_found(unexplained=Unexplained(True, "wall", 80.0, 1e-4)))
-    assert left.endswith("Something is still wrong across the wall that no known effect explains.")
     # 0.0740 / 0.7113 above noise, not significant
     above = diagnosis(base=Scores(0.7853, 0.7113, 0.02, 0.015), untouched_test={})
     assert "at the noise" not in verdict(above)
     assert "10 % above counting noise" in verdict(above)
+    assert tone(CASES["nothing"]) == "fine"
+
+
+def test_the_verdict_on_one_effect():
+    tail = "Your simulation misses a slow detector tail: 21 ± 2 % of the photons, τ = 0.39 ns"
+    one = two_found(effects=[TAIL_ALONE], groups=[])
+    # excess on untouched spots: 1.30 - 0.94 = 0.36 before, 1.03 - 0.93 = 0.10 after, so 72 % explained
+    assert verdict(one) == f"{tail}; modelling it explains 72 % of the excess misfit."
+    # without untouched spots: (1.2417 - 0.9402) = 0.3015, (1.0351 - 0.9251) = 0.11: 64 %
+    assert "64 % of" in verdict(dataclasses.replace(one, untouched_test={}))
+    unknown_size = dataclasses.replace(TAIL_ALONE, parameters={})
+    assert verdict(two_found(effects=[unknown_size], groups=[])).startswith(
+        "Your simulation misses a slow detector tail; modelling it"
+    )
+    assert "<li>" not in report_html(one, {}).split("</header>")[0]
+    assert tone(one) == "found"
+
+
+def test_the_verdict_on_several_effects():
+    several = two_found(effects=[TAIL_ALONE, TILT], groups=[])
+    both = verdict(several)
+    assert both.startswith("Your simulation misses 2 things: (1) a slow detector tail: 21 ± 2 % of")
+    assert "; (2) a relay wall that is tilted against the scan's plane: 41.3 ± 0.9 mrad along x" in both
+    assert both.endswith("; modelling them explains 72 % of the excess misfit.")
+    assert (
+        verdict(several, listed=False)
+        == "Your simulation misses 2 things; modelling them explains 72 % of the excess misfit."
+    )
+    page = report_html(several, {})
+    head = page[page.index("<h1") : page.index("</header>")]
+    assert "mrad" not in head[: head.index("</h1>")]
+    assert head.count("<li>") == 2
+    assert "41.3 ± 0.9 mrad along x" in head
+
+
+def test_the_verdict_on_what_cannot_be_told_apart():
+    weighed = verdict(two_found(effects=[TAIL], groups=[["irf_tail", "afterpulsing"]]))
+    assert weighed == (
+        "Your simulation misses a slow detector tail (81 %) or afterpulsing (counts that trigger further"
+        " counts; 19 %): this capture cannot tell which; the former would be 21 ± 2 % of the photons,"
+        " τ = 0.39 ns; modelling it explains 72 % of the excess misfit."
+    )
+    three = dataclasses.replace(TAIL, weights={"free_time": 0.09, "irf_tail": 0.6, "pile_up": 0.31})
+    assert rivals(two_found(), three) == {"pile_up": 0.31, "free_time": 0.09, "afterpulsing": None}
+    text = verdict(two_found(effects=[three], groups=[]))
+    assert "misses a slow detector tail (60 %), pile-up" in text
+    assert "31 %) or something unknown along the time axis (9 %): this" in text
+    assert "which; the first would be 21 ± 2 %" in text
+    unweighed = verdict(two_found(effects=[TILT]))
+    assert "scan's plane or a time zero that drifts during the scan: this capture cannot" in unweighed
+
+
+def test_the_verdict_on_something_without_a_name():
+    # held-out: 1.1 - 0.7 = 0.4 of excess, 0.9 - 0.7 = 0.2 left
+    wrong = "Something is wrong along the time axis that no known effect explains."
+    assert verdict(CASES["unexplained"]) == f"{wrong} A free term holds 50 % of the excess misfit."
+    assert tone(CASES["unexplained"]) == "unexplained"
+    at_noise = diagnosis(base=Scores(0.7, 0.71, 0, 0), untouched_test={}, unknown=[UNKNOWN["free_time"]])
+    assert verdict(at_noise) == wrong
+    several = [
+        *(UNKNOWN[name] for name in ("free_time_wall", "free_spot_gain", "free_time_scan", "free_wall")),
+        *(free("free_lines", "wall"), free("free_rate", "rate")),
+    ]
+    assert verdict(diagnosis(unknown=several)).startswith(
+        "Something is wrong along the time axis, differently across the wall, from spot to spot, along the"
+        " time axis, differently over the course of the scan, across the wall and with the count rate that"
+        " no known effect explains. 6 free terms hold "
+    )
+    open_ = free("free_wall", "wall", weights={"free_wall": 0.7, "vignetting": 0.3})
+    assert "explains, unless it is " in verdict(diagnosis(unknown=[open_]))
+    assert "(30 %): this capture cannot tell. A free" in verdict(diagnosis(unknown=[open_]))
+
+
+def test_the_verdict_on_names_and_something_else():
+    one = two_found(effects=[TAIL_ALONE], groups=[], unknown=[UNKNOWN["free_wall"]])
+    # held-out: 1.0862 - 1.0262 = 0.06 of 1.2417 - 0.9402 = 0.3015
+    assert verdict(one) == (
+        "Your simulation misses a slow detector tail: 21 ± 2 % of the photons, τ = 0.39 ns. Something else is"
+        " wrong across the wall that no known effect explains; a free term holds 20 % of the excess misfit."
+        " Modelling all of them explains 72 % of the excess misfit."
+    )
+    several = verdict(CASES["both"], listed=False)
+    assert several == (
+        "Your simulation misses 2 things. Something else is wrong across the wall and over the course of the"
+        " scan that no known effect explains; 2 free terms hold 40 % of the excess misfit. Modelling all of"
+        " them explains 72 % of the excess misfit."
+    )
+    assert tone(CASES["both"]) == "unexplained"
+    # where the gain is not known, nothing is said of it
+    assert verdict(CASES["nan"]).endswith("across the wall that no known effect explains.")
 
 
 def test_misfit_parts_add_up_and_keep_to_their_bounds():
@@ -189,16 +264,36 @@ def test_misfit_parts_add_up_and_keep_to_their_bounds():
 
 
 def test_sureness_is_not_more_than_there_is():
-    assert "any one of these effects is 3.0 × 10⁻¹⁴. The gain holds" in sureness(CASES["two"])
-    assert "200 simulated captures" in sureness(CASES["two"])
-    assert "leaves what stays unexplained is 1.0 × 10⁻⁹." in sureness(CASES["unexplained"])
-    assert "no simulated captures were run" in sureness(CASES["unexplained"])
+    assert sureness(CASES["two"]).startswith(
+        "The evidence for each of them is at least 961 nats; 8.16 are needed. The gain holds on wall blocks"
+    )
+    assert sureness(two_found(effects=[TAIL])).startswith("The evidence for it is 9123 nats; 8.16 are")
+    assert "each of them is at least 512 nats" in sureness(CASES["both"])
+    assert sureness(CASES["nothing"]).startswith("The most evidence, 5.48 nats, is for something unknown in")
+    assert "8.16 are needed." in sureness(CASES["nothing"])
+    assert "8.16 are needed, but other spots did not confirm it." in sureness(diagnosis(screened=screened()))
     assert "Effects tested: 23, of which 1 barely identifiable in this capture, 2 not at all" in sureness(
         CASES["nothing"]
     )
+    assert "Free terms tested: 12." in sureness(CASES["nothing"])
     doubtful = dataclasses.replace(TILT, heldout_gain=Gain(1.2, 1.19, 0.001, (-0.001, 0.003)))
-    assert "The gain of 1 of 2 effects holds" in sureness(two_found(effects=[TAIL, doubtful]))
-    assert "chance that noise alone would look" not in sureness(CASES["nan"])
+    assert "The gain of 1 of 2 terms holds" in sureness(two_found(effects=[TAIL, doubtful]))
+    assert "nats" not in sureness(CASES["nan"])
+    assert "captures" not in sureness(CASES["nan"])
+
+
+@pytest.mark.parametrize(
+    ("chance", "toys", "said"),
+    [
+        (0.42, 200, "Of 200 simulated captures without any effect, at most a share of 0.42 gave as much."),
+        (1e-9, 200, "at most a share of 0.0050 gave"),  # 1/201
+        (1e-9, 98, "at most a share of 0.011 gave"),  # 1/99 = 0.0101
+        (0.0, 0, "without any effect: by theory, level < 10⁻³⁰⁰; no simulated captures were run."),
+        (1e-9, 0, "by theory, level 1.0 × 10⁻⁹; no simulated"),
+    ],
+)
+def test_counting_allows_no_smaller_chance_than_it_can(chance, toys, said):
+    assert said in sureness(diagnosis(chance=chance, toys=toys))
 
 
 def test_every_number_is_on_the_page(written):
@@ -210,20 +305,22 @@ def test_every_number_is_on_the_page(written):
             "117 ± 6 mm of path",
             "24.4 ± 1.3 bins",
             "9123",
-            "3.0 × 10⁻¹⁴",
-            "< 10⁻³⁰⁰",
+            "961",
         ),
         *(
             "0.0123 nats",
             "0.0111 … 0.0137",
             "1.242 → 1.190",
-            "afterpulsing",
+            "afterpulsing (19 %)",
             "split by: a capture with other background light",
         ),
         *("41.3 ± 0.9 mrad", "2.37 ± 0.05 °", "−2.1 ± 1.1 mrad", "a second scan in another order"),
-        *("statistic 31.7, p = 0.42", "1.242 0.9402 0.08380 0.04320", "1.030 0.9300 0.05400 0.04310"),
         *(
-            "splat width 0.00117",
+            "along the time axis: 3.17 nats, 8.16 needed",
+            "1.242 0.9402 0.08380 0.04320",
+            "1.030 0.9300 0.05400 0.04310",
+        ),
+        *(
             "1,234,567",
             "0.803",
             "0.260 ns … 0.370 ns",
@@ -237,9 +334,45 @@ def test_every_number_is_on_the_page(written):
     ):
         assert expected in text, expected
     for one in CASES["two"].screened:
-        assert number(one.statistic) in text
-        assert number(one.predicted_gain) in text
+        assert number(one.evidence) in text
         assert describe(one.name).phrase in text
+
+
+def test_scatter_is_said_where_it_is_large():
+    text = Page(report_html(CASES["two"], {})).words
+    one, other = (
+        next(s for s in CASES["two"].screened if s.name == name) for name in ("time_drift", "pile_up")
+    )
+    assert f"{number(one.evidence)} {percent(one.retained_information)} 3.4 6 fraction" in text
+    assert f"{number(other.evidence)} {percent(other.retained_information)} 20 fraction" in text  # 1.4
+
+
+def test_free_terms_have_a_section_of_their_own(written):
+    text = Page(written["both"].read_text(encoding="utf-8")).words
+    part = text[text.index("What no known effect explains") : text.index("Why, and what to do on the rig")]
+    assert "The most evidence is across the wall: 512 nats, 8.16 needed." in part
+    for said in ("free_wall", "rms 12.0 ± 1.0 %", "1.086 → 1.026", "0.00210 nats a photon"):
+        assert said in part, said
+    assert "rms 23.3 ± 1.3 ps = 7.0 ± 0.4 mm of path = 1.46 ± 0.08 bins" in part
+    assert "The free term free_scan_delay: something unknown in the delay over the course" in part
+    assert "The free term free_wall: something unknown across the wall; 0 is no change." in part
+    calm = Page(written["nothing"].read_text(encoding="utf-8")).words
+    assert "No free term is needed. The most evidence of one is along the time axis: 3.17 nats" in calm
+    assert "Numerics" not in calm + text
+
+
+@pytest.mark.parametrize("term", FREE, ids=lambda term: term.name)
+def test_every_free_term_has_words(term):
+    known = describe(term.name)
+    assert known.free
+    assert known.phrase.startswith("something unknown ")
+    assert headline(term.name, {"rms": Estimate(0.12, 0.01, known.number("rms").unit)}).endswith(" rms")
+    assert term.axis in AXES
+    assert not any(describe(effect.name).free for effect in EFFECTS)
+
+
+def test_the_cases_hold_every_free_term():
+    assert {term.name for term in FREE} == set(FREE_NAMES)
 
 
 def test_values_that_are_not_numbers_are_dashes(written):
@@ -253,6 +386,12 @@ def test_markup_in_names_is_escaped(written):
     assert "letters &lt;S&amp;U&gt;" in page
     assert "<S&U>" not in page
     assert "<width>" not in page
+    wild = free("free_<b>", "<em>axis", weights={"free_<b>": 0.5, "<u>": 0.5}, split_by="<s>&")
+    page = report_html(diagnosis(unknown=[wild], groups=[["free_<b>", "<u>"]]), {})
+    assert Page(page).tags.isdisjoint({"em", "u", "s"})
+    assert page.count("free_&lt;b&gt;") >= 3
+    for said in ("&lt;em&gt;axis", "&lt;u&gt; (50 %)", "&lt;s&gt;&amp;"):
+        assert said in page, said
 
 
 def test_what_could_not_have_been_seen_is_said():
@@ -303,6 +442,7 @@ def test_units_people_think_in():
     assert amount("wall_tilt", "tilt_x", 0.04, None) == "40.0 mrad"
     assert (number(0), number(None), number(-1.5e-7, 2), number(math.inf)) == ("0", "–", "−1.5 × 10⁻⁷", "–")
     assert (probability(0.0), probability(0.031), probability(NAN)) == ("< 10⁻³⁰⁰", "0.031", "–")
+    assert (probability(0.0311), probability(0.999), probability(3e-14)) == ("0.032", "1.0", "3.0 × 10⁻¹⁴")
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
@@ -353,7 +493,6 @@ def test_an_effect_without_words_is_called_by_its_name():
         "dust_cloud",
         {"optical_depth": Estimate(0.4, 0.05, "1")},
         99.0,
-        1e-6,
         Gain(1.2, 1.1, 0.01, (0.005, 0.02)),
     )
     text = verdict(two_found(effects=[new], groups=[]))
