@@ -109,6 +109,22 @@ class Effect(nn.Module, Hooks):
         for p in self.declared.values():
             self.set(p.name, self.value(p.name))
 
+    @torch.no_grad()
+    def shift(self, step: Tensor, shapes: bool = False) -> None:
+        """Add to the stored amplitudes, without regard to bounds.
+
+        Args:
+            step: ``[k]``, in order.
+            shapes: its last numbers are added to the stored shapes.
+        """
+        for p in self.amplitudes + (self.shapes if shapes else []):
+            getattr(self, f"raw_{p.name}").add_(step[: p.size])
+            step = step[p.size :]
+
+    def factors(self, spots: Tensor) -> Tensor | None:
+        """``[B, k]`` where the k amplitudes only delay each spot, by Σ_k factor · value; None elsewhere."""
+        return None
+
     def precision(self) -> Tensor:
         """``[k]`` prior precision of all stored values, amplitudes first; 0 where there is no prior."""
         parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]

@@ -2,38 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
-from nlos_lit.effects.effect import Effect
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn, tested_rows, tested_spots
-from nlos_lit.inference.discrepancy import Discrepancy
-from nlos_lit.inference.form import Form
-from nlos_lit.inference.refit import log_likelihood, score
-from nlos_lit.inference.residuals import profiles
-from nlos_lit.inference.result import Accepted, Diagnosis, Gain, Screened, Unexplained
-from nlos_lit.inference.screen import Candidate
+from nlos_lit.effects.free_terms import RATES, Free
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn, needed
+from nlos_lit.inference.heldout import Comparison, score
+from nlos_lit.inference.pool import Candidate, tested_rows
+from nlos_lit.inference.residuals import SIDE, profiles
+from nlos_lit.inference.result import Accepted, Diagnosis, Gain, Screened, Shape, Unexplained
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty
 from nlos_lit.inference.witness import witness
 from nlos_lit.surfels.fit import SurfelFit
 
-SEEN = 25.0  # statistic from which on an effect counts as detectable
-
-
-@dataclass(frozen=True)
-class Verdicts:
-    """What the final fit leaves unexplained, and whether that casts doubt on the names."""
-
-    unexplained: Unexplained
-    dominates: bool
+NINE_OF_TEN = 1.2816  # standard deviations of a score that nine of ten exceed from below
 
 
 def assemble(
@@ -43,7 +34,6 @@ def assemble(
     scan: Scan,
     settings: CriticismSettings,
     null: Null | None,
-    numerics: dict[str, float],
     name: str,
     seconds: float,
     seed: int,
@@ -57,7 +47,6 @@ def assemble(
         scan: of the capture.
         settings: of the criticism.
         null: what toys of the base show; None where there are none.
-        numerics: changes of the deviance when only the computation is varied.
         name: of the capture.
         seconds: the diagnosis took.
         seed: of it.
@@ -68,49 +57,32 @@ def assemble(
     base, final = found.base, found.final
     rows = tested_rows(final, split, settings.spots, seed)
     spots = split.fit[rows]
-    counts, block = final.counts[rows], torch.from_numpy(split.block[spots])
-    uncertainty = Uncertainty(final, torch.from_numpy(spots), counts, block, len(rows) / len(split.fit))
-    verdicts = judge(found, split, settings)
-    fresh = (
-        found.again.extension.effects
-        if found.again is not None and sensible(found.again, base, split)
-        else []
-    )
-    effects, groups, notes = [], [], []
-    for turn in [] if verdicts.dominates else found.accepted:
-        trial = _taken(turn)
-        p, feigned = weighed(trial.candidate, null, settings.level)
-        if feigned:
-            notes.append(
-                f"{trial.name} improved the fit,"
-                f" but captures simulated without it score as much (p = {p:.2g})"
-            )
-            continue
-        effect = next(e for e in final.extension.effects if e.name == trial.name)
-        again = next((e for e in fresh if e.name == effect.name), None)
-        group = alternatives(turn, found.accepted)
-        effects.append(_accepted(turn, effect, again, group, uncertainty, split, p))
-        if group:
-            groups.append([trial.name, *group])
-    if verdicts.dominates:
-        names = ", ".join(_taken(t).name for t in found.accepted)
-        notes.append(f"{names}: improved the fit but left too much of what shows, and therefore not named")
-        final = base
-    if found.wrong is not None:
-        notes.append(_of_another_form(found.wrong))
+    block = torch.from_numpy(split.block[spots])
+    share = len(rows) / len(split.fit)
+    uncertainty = Uncertainty(final, torch.from_numpy(spots), final.counts[rows], block, share)
+    accepted = [_accepted(turn, found, uncertainty, split, scan) for turn in found.accepted]
+    named = [a for a in accepted if not a.axis]
+    unknown = [a for a in accepted if a.axis]
+    first = found.turns[0].candidates
+    worst = max(unknown, key=lambda a: a.evidence, default=None)
+    left = [(c.effect.axis, c.evidence) for c in found.turns[-1].candidates if isinstance(c.effect, Free)]
+    most = left[0] if worst is None else (worst.axis, worst.evidence)
     fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
+    largest = first[0].evidence
     return Diagnosis(
-        effects=effects,
-        groups=groups,
-        unexplained=verdicts.unexplained,
-        screened=[_screened(c, null) for c in found.turns[0].candidates],
+        effects=named,
+        unknown=unknown,
+        groups=[[a.name, *a.confusable_with] for a in named if a.confusable_with],
+        unexplained=Unexplained(worst is not None, *most),
+        screened=[_screened(c, needed(first, settings)) for c in first],
         base=score(base, split.select),
         extended=score(final, split.select),
         untouched_test={"base": score(base, test), "extended": score(final, test)},
         witness=witness(capture, final),
         profiles=profiles(base, final, scan, fitted),
-        numerics=numerics,
-        notes=notes,
+        needed=needed(first, settings),
+        chance=min(1.0, len(first) * math.exp(-largest)) if null is None else null.chance(largest),
+        notes=[],
         capture=_facts(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
@@ -118,152 +90,50 @@ def assemble(
     )
 
 
-def weighed(candidate: Candidate, null: Null | None, level: float) -> tuple[float, bool]:
-    """How sure an effect is.
-
-    Args:
-        candidate: that was screened.
-        null: what toys of the base show; None where there are none.
-        level: p-value up to which an effect is significant.
-
-    Returns:
-        p-value, by toys where there are any, and whether it was only they who spoke against the effect.
-    """
-    p = candidate.p_value if null is None else null.p_value(candidate)
-    return p, candidate.p_value <= level < p
-
-
-def alternatives(turn: Turn, accepted: list[Turn]) -> list[str]:
-    """A turn's group without what is needed beside its effect: that is no other name for it.
-
-    Args:
-        turn: of the loop.
-        accepted: all turns that accepted an effect.
-
-    Returns:
-        Names of effects.
-    """
-    names = {_taken(t).name for t in accepted}
-    return [name for name in turn.group if name not in names]
-
-
-def _of_another_form(form: Form) -> str:
-    share = f"({form.gain:.0f} nats, of {form.own:.0f} that it changes itself)"
-    why = (
-        f"would need another strength in every stretch of the {form.axis} axis {share}"
-        if form.axis == "time"
-        else f"is a falling function of the scene's own count rate {share}, of which it should know nothing"
-    )
-    return f"{form.name} improved the fit, but {why}, and is therefore not named"
-
-
-def judge(found: Findings, split: Split, settings: CriticismSettings) -> Verdicts:
-    """The largest flexible discrepancy that is left, and whether it outweighs what the named effects explain.
-
-    A map that was taken back because it follows the count rate says so itself; another effect of the wrong
-    form only where nothing else does.
-
-    Args:
-        found: by the loop.
-        split: of the spots.
-        settings: of the criticism.
-
-    Returns:
-        What is left, and whether it casts doubt on the names.
-    """
-    rest = [
-        d for d in found.left if d.p_value * len(found.left) < settings.level and d.gain > settings.least_gain
-    ]
-    worst = max(rest, key=lambda d: d.gain, default=None)
-    if found.wrong is not None:
-        dominates = worst is not None and _outweighs(worst, found, split, settings)
-        cause = found.wrong if worst is None or found.wrong.axis == "rate" else worst
-        return Verdicts(Unexplained(True, cause.axis, cause.statistic, cause.p_value), dominates)
-    if worst is None:
-        calm = max(found.left, key=lambda d: d.gain)
-        return Verdicts(Unexplained(False, calm.axis, calm.statistic, calm.p_value), False)
-    return Verdicts(
-        Unexplained(True, worst.axis, worst.statistic, worst.p_value),
-        _outweighs(worst, found, split, settings),
-    )
-
-
-def _outweighs(left: Discrepancy, found: Findings, split: Split, settings: CriticismSettings) -> bool:
-    """Whether names hold less than the share ``explained`` of the misfit.
-
-    That is of all that they gain and is left, nats a spot; or, where most of what they were predicted to gain
-    was of this very kind, of what the base had of it.
-    """
-    if not found.accepted:
-        return False
-    tested = tested_spots(found.final, split, settings.spots)
-    spared = 1 - settings.explained
-    named = sum(_taken(t).gain.nats for t in found.accepted) / len(split.select)
-    if spared * named < settings.explained * left.gain / tested:
-        return True
-    had = next((d.gain for d in found.turns[0].discrepancies if (d.axis, d.of) == (left.axis, left.of)), 0.0)
-    had *= tested / tested_spots(found.base, split, settings.spots)
-    predicted = sum(_taken(t).candidate.gain for t in found.accepted)
-    return had - left.gain > 0.5 * predicted and left.gain > spared * had
-
-
-def sensible(again: SurfelFit, base: SurfelFit, split: Split) -> bool:
-    """Whether a rebuild got somewhere: it is likelier than the base. Else it says nothing of the effects.
-
-    Args:
-        again: the rebuild, with effects.
-        base: without them.
-        split: of the spots; those selected with decide.
-
-    Returns:
-        True where its effects may be looked at.
-    """
-    with_, without = (float(log_likelihood(fit, split.select).sum()) for fit in (again, base))
-    return with_ > without
-
-
-def _taken(turn: Turn) -> Trial:
-    """What a turn accepted, where it did."""
-    assert turn.accepted is not None
-    return turn.accepted
-
-
-def _accepted(
-    turn: Turn,
-    effect: Effect,
-    again: Effect | None,
-    group: list[str],
-    uncertainty: Uncertainty,
-    split: Split,
-    p: float,
-) -> Accepted:
-    trial = _taken(turn)
+def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Split, scan: Scan) -> Accepted:
+    trial = turn.accepted
+    assert trial is not None  # what makes a turn one of these
+    assert trial.candidate is not None
+    effect = next(e for e in found.final.extension.effects if e.name == trial.name)
+    others = () if found.again is None else found.again.extension.effects
+    again = next((e for e in others if e.name == effect.name), None)
+    kept = {_name(t) for t in found.accepted}
+    weights = {
+        t.name: t.weight for t in turn.trials if t is trial or (t.name in turn.group and t.name not in kept)
+    }
+    total = sum(weights.values())
+    free = effect if isinstance(effect, Free) else None
+    loss = found.losses.get(trial.name, trial.gain)
     return Accepted(
         name=effect.name,
         parameters=uncertainty.parameters(effect, again),
-        statistic=trial.candidate.statistic,
-        p_value=p,
-        heldout_gain=_gain(trial, split),
-        confusable_with=group,
-        split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in group} - {""})),
+        evidence=trial.candidate.evidence,
+        heldout_gain=_gain(found.final, loss, split),
+        weights={name: weight / total for name, weight in weights.items()},
+        split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
+        axis=free.axis if free else "",
+        shape=shape_of(free, scan) if free else None,
     )
 
 
-def _gain(trial: Trial, split: Split) -> Gain:
-    fit, spots = trial.fit, split.select
+def _name(turn: Turn) -> str:
+    return "" if turn.accepted is None else turn.accepted.name
+
+
+def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
+    """What the term's absence costs, a bin and a photon of the select spots."""
     first, last = fit.capture.gate
-    photons = float(fit.capture.counts[spots, first:last].sum())
-    after = score(fit, spots).deviance_per_bin
-    bins = len(spots) * (last - first)
-    low, high = trial.gain.interval
-    return Gain(
-        after + 2 * trial.gain.nats / bins, after, trial.gain.nats / photons, (low / photons, high / photons)
-    )
+    photons = float(fit.capture.counts[split.select, first:last].sum())
+    after = score(fit, split.select).deviance_per_bin
+    low, high = loss.interval
+    bins = len(split.select) * (last - first)
+    return Gain(after + 2 * loss.nats / bins, after, loss.nats / photons, (low / photons, high / photons))
 
 
-def _screened(candidate: Candidate, null: Null | None) -> Screened:
+def _screened(candidate: Candidate, least: float) -> Screened:
     effect, start = candidate.effect, 0
     step, detectable = {}, {}
+    visible = visible_score(least) + NINE_OF_TEN
     for p in effect.amplitudes:
         part = slice(start, start + p.size)
         error = candidate.error[part][torch.isfinite(candidate.error[part])]
@@ -273,20 +143,81 @@ def _screened(candidate: Candidate, null: Null | None) -> Screened:
                 if p.size > 1
                 else float((p.null or 0.0) + p.scale * candidate.step[part])
             )
-        detectable[p.name] = float(SEEN**0.5 * p.scale * error.square().mean().sqrt())
+        detectable[p.name] = float(visible * p.scale * error.square().mean().sqrt())
         start += p.size
     return Screened(
         name=effect.name,
-        statistic=candidate.statistic,
-        p_value=candidate.p_value if null is None else null.p_value(candidate),
+        evidence=candidate.evidence,
         retained_information=candidate.retained,
-        degrees=candidate.degrees,
-        predicted_gain=candidate.gain,
+        scatter=candidate.scatter,
+        degrees=2 if effect.per_spot else len(candidate.step),
         one_step=step,
         shape=candidate.shape,
         detectable=detectable,
-        expected=float(candidate.degrees) if null is None else null.expected(candidate),
     )
+
+
+def visible_score(least: float) -> float:
+    """Score, in standard deviations, at which one coefficient has so much evidence: ½(u² - 1 - ln u²) nats.
+
+    Examples:
+        >>> round(visible_score(8.3), 2)
+        4.54
+    """
+    low, high = 1.0, 2.0 + 2.0 * max(least, 1.0)
+    for _ in range(60):
+        u = (low + high) / 2
+        low, high = (u, high) if 0.5 * (u**2 - 1 - math.log(u**2)) < least else (low, u)
+    return low
+
+
+@torch.no_grad()
+def shape_of(effect: Free, scan: Scan) -> Shape:
+    """What a free term looks like.
+
+    Over the wall and time it is the leading pair of the table of spots and bins: the map over the wall, times
+    the root mean square of what it does along time.
+
+    Args:
+        effect: a free term.
+        scan: of the capture.
+
+    Returns:
+        its values along its axis.
+    """
+    (p,) = effect.amplitudes
+    first, last = scan.gate
+    values = effect.values()
+    if effect.axis == "time":
+        return Shape("time", p.unit, np.arange(first, last + 1.0), values[first:last].numpy())
+    if effect.axis == "rate":
+        edges = scan.mean_counts * np.exp(np.linspace(*RATES, len(values) + 1))
+        return Shape("rate", p.unit, edges, values.numpy())
+    if effect.axis == "scan":
+        edges, mean = _along_scan(values[:, None], scan)
+        return Shape("scan", p.unit, edges, mean[:, 0])
+    if effect.axis == "time×scan":
+        edges, mean = _along_scan(values[:, first:last], scan)
+        return Shape(effect.axis, p.unit, edges, mean, np.arange(first, last + 1.0))
+    if effect.axis == "time×wall":
+        left, size, _ = torch.linalg.svd(values[:, first:last], full_matrices=False)
+        values = left[:, 0] * size[0] / math.sqrt(last - first)
+    place = torch.clamp(((scan.places[-1] + 1) / 2 * SIDE).long(), 0, SIDE - 1)
+    mean = _means(values[:, None], place[:, 0] * SIDE + place[:, 1], SIDE**2).reshape(SIDE, SIDE)
+    edges_x, edges_y = (c + np.linspace(-scan.half, scan.half, SIDE + 1) for c in scan.centre.tolist())
+    return Shape(effect.axis, p.unit, edges_x, mean, edges_y)
+
+
+def _along_scan(values: Tensor, scan: Scan, number: int = 64) -> tuple[np.ndarray, np.ndarray]:
+    number = min(number, scan.n_spots)
+    band = ((scan.rank + 1) / 2 * number).long().clamp(0, number - 1)
+    return np.linspace(0, scan.n_spots, number + 1), _means(values, band, number)
+
+
+def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
+    total = torch.zeros(number, values.shape[1]).index_add_(0, band, values)
+    spots = torch.zeros(number).index_add_(0, band, torch.ones(len(band)))
+    return (total / spots[:, None]).numpy()
 
 
 def _facts(capture: Capture, name: str) -> dict[str, Any]:

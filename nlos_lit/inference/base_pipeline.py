@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -17,6 +17,8 @@ from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.runtime.memory import check_machine
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels
+
+COARSE = 3  # rounds of a parsimonious scene
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,7 @@ class BasePipeline:
         image: tuple[Tensor, VolumeGrid],
         extension: Extension,
         seed: int,
+        fine: bool = True,
     ) -> SurfelFit:
         """Surfels from new seeds, with the given effects.
 
@@ -61,13 +64,18 @@ class BasePipeline:
             image: ``[nz, nx, ny]`` and its grid, from :meth:`image`.
             extension: effects, fitted along in place.
             seed: of batches and tested spots.
+            fine: rounds follow and surfels are divided as long as the counts ask for it; else the scene stays
+                as parsimonious as its seeds, and what it lacks is seen in the residual.
 
         Returns:
             the fit, converged.
         """
-        given = (capture, *image, self.surfels, split.fit)
+        settings = self.surfels
+        if not fine:
+            settings = replace(settings, rounds=min(COARSE, settings.rounds), more=0)
+        given = (capture, *image, settings, split.fit)
         return fit_surfels(*given, extension=extension, seed=seed).fit
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
-        """Image and fit without effects."""
-        return self.fit(capture, split, self.image(capture), Extension([]), seed)
+        """Image and parsimonious fit without effects."""
+        return self.fit(capture, split, self.image(capture), Extension([]), seed, fine=False)

@@ -1,81 +1,94 @@
-"""Show, name, extend, measure: the loop that finds out which physical effects a capture asks for
-(docs/criticism.md).
+"""Show, name, extend, measure: the loop that finds out what a capture asks for (docs/criticism.md).
+
+A turn asks the pool, rebuilds the scene with its leaders, and decides on spots that were not fitted. More
+scene stands in the same contest: the same model with finer and more surfels. What gains most is taken.
 """
 
 from __future__ import annotations
 
+import copy
 import logging
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.discrepancy import Discrepancy, counted, discrepancies, smooth
-from nlos_lit.inference.form import Form, forms_of
-from nlos_lit.inference.joint_step import copy_effects, null_of
-from nlos_lit.inference.needless import drop_needless
-from nlos_lit.inference.problem import Problem, build_problem
-from nlos_lit.inference.refit import compare, log_likelihood, refit_with, score
-from nlos_lit.inference.screen import FOLDS, Candidate, Projector, screen
+from nlos_lit.effects.free_terms import FREE_NAMES
+from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, weights
+from nlos_lit.inference.per_spot import solve
+from nlos_lit.inference.pool import Candidate, ask
+from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
-from nlos_lit.inference.trials import Trial, best_of_each, choose, group_of
 from nlos_lit.runtime.steps import Steps
 from nlos_lit.surfels.fit import SurfelFit
 
 log = logging.getLogger(__name__)
-WORK = 1e12  # multiplications of the nuisance columns with each other, some 40 s of one core
-WELL = 0.01  # retained information from which on an effect counts as well identifiable
-Rebuild = Callable[[Extension, int], SurfelFit]
+Rebuild = Callable[[Extension, int, bool], SurfelFit]
+LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
+WARM = 120  # batches, and as many again at falling rate
+HOPELESS = 0.05  # of the best evidence: a rebuild does not turn such odds
 
 
 @dataclass(frozen=True)
 class CriticismSettings:
-    """How hard an effect must be asked for before it is named.
+    """How hard a term must be asked for before the model is extended with it.
 
     Args:
-        spots: fitted spots that score tests look at at most (fewer where there are very many surfels).
-        level: largest p-value, Holm-adjusted over all effects.
-        least_gain: nats that the score test must predict …
-        least_shape: … for effects that neither move nor scale the light: of these the base's own errors feign
-            fewer …
-        least_share: … and share of the misfit beyond noise (fitted spots) that this must be: what is smaller
-            may be the base's own.
-        rivals: effects that are refitted before one is chosen. finalists: of them, with which the scene is
-            rebuilt from new seeds; the one that was screened best is always among them.
-        hopeless: share of the best predicted gain below which an effect is no rival.
-        far_off: misfit over noise from which on single-path effects are finalists whatever their score.
-        similar: correlation of projected sensitivities from which on two effects are one group.
-        steps: batches of a refit (and as many again at falling rate).
-        most: effects that are accepted at most.
-        explained: share of the structured misfit that named effects must explain; below it, the misfit is
-            called unexplained.
-        numerics: vary seed and quadrature of the base, too.
+        spots: fitted spots that the pool is asked on at most.
+        level: chance of a false name that is borne: a term needs ln(terms in the pool/level) nats of
+            evidence.
+        errors: standard errors by which a gain on other spots must exceed 0.
+        rivals: terms with which the fit goes on in a turn. finalists: of them, with which the scene is
+            rebuilt from new seeds, too; the one with the most evidence is always among them.
+        open_share: weight from which on a rival belongs to what the capture cannot tell from the best.
+        most: terms that are accepted at most.
         toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
             side by side.
     """
 
     spots: int = 1024
-    level: float = 1e-3
-    least_gain: float = 25.0
-    least_shape: float = 15.0
-    least_share: float = 0.02
+    level: float = 0.01
+    errors: float = 2.0
     rivals: int = 5
-    hopeless: float = 0.2
-    finalists: int = 3
-    far_off: float = 0.15
-    similar: float = 0.9
-    steps: int = 120
+    finalists: int = 2
+    open_share: float = 0.05
     most: int = 5
-    explained: float = 0.67
-    numerics: bool = True
     toys: int = 0
     processes: int = 2
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The scene rebuilt with one more term, or with none but finer.
+
+    Args:
+        candidate: the term; None for more scene.
+        fit: the rebuilt scene.
+        likelihood: ``[S]`` of the select spots, nats.
+        gain: over the fit that the turn began with.
+        weight: how far the capture leaves open that this is the best of its turn.
+    """
+
+    candidate: Candidate | None
+    fit: SurfelFit
+    likelihood: Tensor = field(repr=False)
+    gain: Comparison
+    weight: float = 0.0
+
+    @property
+    def name(self) -> str:
+        return "more scene" if self.candidate is None else self.candidate.name
+
+
+Job = tuple[str, Candidate | None, Callable[[], SurfelFit | None]]  # what is said, term, what makes the fit
 
 
 @dataclass(frozen=True)
@@ -83,305 +96,18 @@ class Turn:
     """One turn of the loop.
 
     Args:
-        candidates: the screening, largest predicted gain first.
-        discrepancies: flexible ones, largest gain first.
-        trials: the rivals after their refits, most evidence first.
+        candidates: the pool, most evidence first.
+        trials: rebuilt scenes, the largest gain first.
         accepted: one of them; None ends the loop.
         group: names that the capture cannot tell from the accepted one.
-        controls: fits without another effect.
-        form: of the effect that was accepted before, where it is wrong.
+        grown: the base was fine already.
     """
 
     candidates: list[Candidate]
-    discrepancies: list[Discrepancy]
-    trials: list[Trial]
-    accepted: Trial | None
-    group: list[str]
-    controls: list[SurfelFit | None] = field(default_factory=list)
-    form: Form | None = None
-
-
-def tested_spots(fit: SurfelFit, split: Split, most: int) -> int:
-    """How many fitted spots score tests look at; gains are nats over these.
-
-    Args:
-        fit: whose surfels make the columns.
-        split: whose ``fit`` spots there are.
-        most: spots; fewer where their products would exceed ``WORK``.
-
-    Returns:
-        a number of spots.
-    """
-    columns = 2 * len(fit.model) + 64
-    return min(most, len(split.fit), max(64, int(WORK / (fit.counts.shape[1] * columns**2))))
-
-
-def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
-    """Which fitted spots score tests look at.
-
-    Args:
-        fit: that is tested.
-        split: of its spots.
-        most: see :func:`tested_spots`.
-        seed: of the choice.
-
-    Returns:
-        sorted rows of ``split.fit`` (and of the fit's counts).
-    """
-    return np.sort(np.random.default_rng(seed).permutation(len(split.fit))[: tested_spots(fit, split, most)])
-
-
-def tested_problem(fit: SurfelFit, split: Split, most: int, seed: int) -> tuple[Problem, torch.Tensor]:
-    """The weighted least-squares problem of tested spots.
-
-    Args:
-        fit: that is tested.
-        split: of its spots.
-        most: see :func:`tested_spots`.
-        seed: of the choice.
-
-    Returns:
-        the problem of S spots, and ``[S]`` their folds.
-    """
-    rows = tested_rows(fit, split, most, seed)
-    spots = torch.from_numpy(split.fit[rows])
-    return build_problem(fit.model, fit.extension, spots, fit.counts[rows]), split.folds(spots, FOLDS)
-
-
-@dataclass(frozen=True)
-class Look:
-    """Effects and flexible discrepancies as the score tests see them.
-
-    Args:
-        candidates: effects, largest predicted gain first.
-        discrepancies: flexible ones, largest gain first.
-        own: ``[P]`` the step that the base alone would take.
-        form: of the effect asked about, where it is wrong.
-    """
-
-    candidates: list[Candidate]
-    discrepancies: list[Discrepancy]
-    own: torch.Tensor
-    form: Form | None = None
-
-
-def look(fit: SurfelFit, split: Split, scan: Scan, s: CriticismSettings, seed: int, latest: str = "") -> Look:
-    """Screen all effects that the fit does not have yet, and the flexible discrepancies.
-
-    Args:
-        fit: that is criticised.
-        split: of its spots.
-        scan: of the capture.
-        s: settings.
-        seed: of the spots that are looked at.
-        latest: name of the effect whose form is looked at, too.
-
-    Returns:
-        what the tests say; nothing but the form where that is wrong.
-    """
-    problem, folds = tested_problem(fit, split, s.spots, seed)
-    have = {e.name for e in fit.extension.effects}
-    projector = Projector(problem)
-    wrong = [
-        form
-        for e in fit.extension.effects
-        if e.name == latest
-        for form in forms_of(problem, projector, e)
-        if form.wrong
-    ]
-    if wrong:  # the effect goes, and with it all that a screening beside it would say
-        return Look([], [], projector.own, wrong[0])
-    candidates = screen(problem, projector, [e(scan) for e in EFFECTS if e.name not in have], folds)
-    asked = [
-        c.effect
-        for c in candidates
-        if c.effect.per_spot and c.p_value < s.level and c.gain > needed(c, s, 0.0)
-    ]
-    rest = discrepancies(problem, projector, scan, asked)
-    return Look(candidates, rest, projector.own)
-
-
-def turn(
-    fit: SurfelFit,
-    rebuild: Rebuild,
-    split: Split,
-    scan: Scan,
-    s: CriticismSettings,
-    seed: int,
-    steps: Steps,
-    latest: str = "",
-) -> Turn:
-    """Screen, refit the rivals, rebuild the scene with the finalists, choose.
-
-    The control goes through the same without another effect (as it is, refitted, or rebuilt with another
-    random seed).
-
-    Where the base is far off, linear tests around it say little about effects that bend single paths: these
-    are rebuilt with, too. Else, where a function of the count rate says more than any effect, the counting is
-    none that the registry knows: no rivals.
-
-    Args:
-        fit: with the effects accepted so far.
-        rebuild: a fit from new seeds with given effects and random seed.
-        split: of the spots.
-        scan: of the capture.
-        s: settings.
-        seed: of everything random.
-        steps: says and keeps what is done.
-        latest: name of the effect that was accepted last.
-
-    Returns:
-        the turn; its ``accepted`` is None where no effect is asked for.
-    """
-    number = len(fit.extension.effects) + 1
-    steps.plan(screen=1, refit=s.rivals + 1, fit=s.finalists)
-    screening = partial(look, fit, split, scan, s, seed, latest)
-    seen = steps("screen", f"screening effects, turn {number}", f"turn{number}_screen", screening)
-    candidates, rest = seen.candidates, seen.discrepancies
-    if seen.form is not None:
-        return Turn(candidates, rest, [], None, [], form=seen.form)
-    (misfit, noise), tested = misfit_and_noise(fit, split), tested_spots(fit, split, s.spots)
-    over = misfit * tested / len(split.fit)
-    possible = [c for c in candidates if not smooth(rest, c.effect.name, c.gain)]
-    wanted = significant(possible, s, over)
-    far_off = misfit > s.far_off * noise
-    if not far_off and (not wanted or counted(rest) > wanted[0].gain + s.least_gain):
-        return Turn(candidates, rest, [], None, [])
-    rivals = [c for c in wanted[: s.rivals] if c.gain > s.hopeless * wanted[0].gain]
-    steps.plan(refit=1 + len(rivals), fit=1 + min(s.finalists, len(rivals)))
-    own = partial(refit_with, fit, [], s.steps, seed, seen.own)
-    controls: list[SurfelFit | None] = [
-        fit,
-        steps("refit", "refitting the control", f"turn{number}_control", own),
-    ]
-    tries = []
-    for c in rivals:
-        refit = partial(refit_with, fit, [c], s.steps, seed)
-        again = steps(
-            "refit", f"refitting with {c.effect.name}", f"turn{number}_refit_{c.effect.name}", refit
-        )
-        tries.append((c, again, log_likelihood(again, split.select)))
-    weight = len(split.fit) / tested  # of a prediction for the tested spots
-    tries.sort(key=lambda t: -float(t[2].sum()) - weight * t[0].gain)
-    finalists = [
-        (c, again.extension) for k, (c, again, _) in enumerate(tries) if k < s.finalists or c is wanted[0]
-    ]
-    if far_off:
-        tried = {c.effect.name for c, _ in finalists}
-        bending = [c for c in candidates if c.effect.stage == "path" and c.effect.name not in tried]
-        finalists += [(c, copy_effects(fit.extension, [null_of(c.effect)])) for c in bending]
-    steps.plan(fit=1 + len(finalists))
-    jobs = [
-        (
-            "rebuilding the control",
-            f"turn{number}_rebuild",
-            partial(_rebuilt, rebuild, fit.extension, seed + 1),
-        )
-    ]
-    for c, extension in finalists:
-        text, name = f"rebuilding the scene with {c.effect.name}", f"turn{number}_rebuild_{c.effect.name}"
-        jobs.append((text, name, partial(_rebuilt, rebuild, extension, seed)))
-    control, *rebuilt = steps.several("fit", jobs, s.processes)
-    controls.append(control)
-    pairs = zip(finalists, rebuilt, strict=True)
-    tries += [(c, again, log_likelihood(again, split.select)) for (c, _), again in pairs if again is not None]
-    reference, block = best_likelihood(controls, split), split.block[split.select]
-    trials = best_of_each(
-        [
-            Trial(c, again, compare(reference, value, block), value, weight * c.gain)
-            for c, again, value in tries
-        ]
-    )
-    share = len(split.select) / tested
-    held = [
-        t
-        for t in trials
-        if t.gain.nats > max(t.gain.error, share * needed(t.candidate, s, over, rebuilt=True))
-    ]
-    if not held:
-        return Turn(candidates, rest, trials, None, [], controls)
-    best = choose(held, block)
-    return Turn(candidates, rest, trials, best, group_of(best, trials, block, s.similar), controls)
-
-
-def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int) -> SurfelFit | None:
-    """None: with these effects no surfel survives, so that they are not the ones."""
-    try:
-        return rebuild(copy_effects(extension, []), seed)
-    except UserError as error:
-        log.info("a rebuild leaves nothing: %s", error)
-        return None
-
-
-def best_likelihood(fits: list[SurfelFit | None], split: Split) -> torch.Tensor:
-    """Log-likelihoods of the select spots of the best of several fits.
-
-    Args:
-        fits: that are compared; None are skipped.
-        split: of the spots.
-
-    Returns:
-        ``[S]`` nats.
-    """
-    found = [log_likelihood(f, split.select) for f in fits if f is not None]
-    return max(found, key=lambda values: float(values.sum()))
-
-
-def needed(candidate: Candidate, s: CriticismSettings, over: float, rebuilt: bool = False) -> float:
-    """Nats over the tested spots that an effect must promise, or gain once the scene is rebuilt.
-
-    A base that has not quite converged is off along what it could imitate, and what is left of an effect
-    takes that for its own: nats in inverse proportion to the retained information. Below ``WELL`` the rebuilt
-    scene must gain as much more.
-
-    Args:
-        candidate: the effect.
-        s: settings.
-        over: misfit of the tested spots, nats.
-        rebuilt: of a rebuilt scene, not of the screening.
-
-    Returns:
-        nats.
-    """
-    least = s.least_gain if candidate.effect.moves_light else s.least_shape
-    scarce = max(1.0, WELL / max(candidate.retained, 1e-6)) if rebuilt else 1.0
-    return max(least * scarce, s.least_share * over)
-
-
-def misfit_and_noise(fit: SurfelFit, split: Split) -> tuple[float, float]:
-    """Misfit beyond noise, and noise, measured on the select spots.
-
-    Args:
-        fit: that is judged.
-        split: of the spots.
-
-    Returns:
-        both in nats over as many spots as were fitted.
-    """
-    scores = score(fit, split.select)
-    nats = fit.counts.shape[1] * len(split.fit) / 2
-    return (scores.deviance_per_bin - scores.deviance_noise) * nats, scores.deviance_noise * nats
-
-
-def significant(candidates: list[Candidate], s: CriticismSettings, over: float) -> list[Candidate]:
-    """Candidates whose Holm-adjusted p-value and predicted gain pass.
-
-    Args:
-        candidates: largest predicted gain first.
-        s: settings.
-        over: misfit of the tested spots, nats.
-
-    Returns:
-        those that pass, in the same order.
-    """
-    order = sorted(candidates, key=lambda c: c.p_value)
-    passed, worst = set(), 0.0
-    for rank, candidate in enumerate(order):
-        worst = max(worst, candidate.p_value * (len(order) - rank))
-        if worst > s.level:
-            break
-        passed.add(candidate.effect.name)
-    return [c for c in candidates if c.effect.name in passed and c.gain > needed(c, s, over)]
+    trials: list[Trial] = field(default_factory=list)
+    accepted: Trial | None = None
+    group: list[str] = field(default_factory=list)
+    grown: bool = False
 
 
 @dataclass
@@ -389,31 +115,308 @@ class Findings:
     """What the loop leaves behind.
 
     Args:
-        base: the fit without effects.
-        final: the fit with all effects that were kept.
+        base: the fit without effects, as fine as the final one.
+        final: the fit with all terms that were kept.
         turns: of the loop.
-        again: the final fit from new seeds; None without effects, or where no surfel survived.
+        losses: what each kept term's absence costs on the select spots, once the scene is rebuilt without.
+        again: another fit with the terms of the final one; None where there is none.
     """
 
     base: SurfelFit
     final: SurfelFit
     turns: list[Turn]
+    losses: dict[str, Comparison] = field(default_factory=dict)
     again: SurfelFit | None = None
 
     @property
     def accepted(self) -> list[Turn]:
+        """Turns whose term was kept."""
         kept = {e.name for e in self.final.extension.effects}
         return [t for t in self.turns if t.accepted is not None and t.accepted.name in kept]
 
-    @property
-    def left(self) -> list[Discrepancy]:
-        """Flexible discrepancies of the final fit."""
-        return self.turns[-1 if self.wrong is None else -2].discrepancies
 
-    @property
-    def wrong(self) -> Form | None:
-        """Form of the effect that was accepted last, and not kept because of it."""
-        return self.turns[-1].form
+def needed(candidates: list[Candidate], s: CriticismSettings) -> float:
+    """Nats that a term of this pool needs.
+
+    Args:
+        candidates: the pool.
+        s: settings.
+
+    Returns:
+        ln(terms/level).
+    """
+    return math.log(len(candidates) / s.level)
+
+
+def begun_with(fit: SurfelFit, extra: list[Candidate]) -> Extension:
+    """A copy of the fit's extension with more terms, begun where the pool saw them.
+
+    A step of the linear problem may be far too long where a term bends the light, and is shortened until the
+    counts are likelier; numbers of single spots are solved for and not moved by an optimiser.
+
+    Args:
+        fit: whose extension it is.
+        extra: the terms.
+
+    Returns:
+        a new extension.
+    """
+
+    def begun(length: float) -> Extension:
+        added = []
+        for candidate in extra:
+            effect = copy.deepcopy(candidate.effect)
+            effect.shift(length * candidate.step)
+            effect.clamp()
+            added.append(effect.requires_grad_(not effect.per_spot))
+        return copy_effects(fit.extension, added)
+
+    def likelihood(extension: Extension) -> float:
+        counts = fit.counts[fit.tested]
+        expected = fit.model.expected(fit.train[fit.tested], extension).clamp_min(1e-9)
+        return float((torch.xlogy(counts, expected) - expected).double().sum())
+
+    return max((begun(length) for length in LENGTHS), key=likelihood) if extra else begun(0.0)
+
+
+def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
+    """A copy of the extension with more effects at their present values, in order of application.
+
+    Args:
+        extension: that is copied.
+        extra: effects, copied too.
+
+    Returns:
+        a new extension.
+    """
+    return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
+
+
+def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int, fine: bool) -> SurfelFit | None:
+    """None: with these effects no surfel survives, so that they are not the ones."""
+    try:
+        fit = rebuild(copy_effects(extension, []), seed, fine)
+    except UserError as error:
+        log.info("a rebuild leaves nothing: %s", error)
+        return None
+    return solve_spots(fit)
+
+
+def solve_spots(fit: SurfelFit) -> SurfelFit:
+    """The fit, with numbers of single spots solved for: random batches would visit each a few times only."""
+    for effect in fit.extension.effects:
+        if effect.per_spot:
+            solve(fit.model, fit.extension, effect, fit.train, fit.counts)
+    return fit
+
+
+class Loop:
+    """All turns of one capture.
+
+    Args:
+        rebuild: a fit from new seeds with given effects, begun at their present values, random seed, and
+            whether surfels may be divided as finely as the counts ask for.
+        split: of the spots.
+        scan: of the capture.
+        settings: of the criticism.
+        seed: of everything random.
+        steps: says and keeps what is done.
+    """
+
+    def __init__(
+        self, rebuild: Rebuild, split: Split, scan: Scan, settings: CriticismSettings, seed: int, steps: Steps
+    ) -> None:
+        self.rebuild, self.split, self.scan, self.settings = rebuild, split, scan, settings
+        self.seed, self.steps, self.number = seed, steps, 0
+        self.block = split.block[split.select]
+
+    def turn(self, fit: SurfelFit, grown: bool) -> Turn:
+        """Ask the pool, rebuild the scene with its leaders and finer, choose.
+
+        Args:
+            fit: with the terms accepted so far.
+            grown: it is as fine as it gets.
+
+        Returns:
+            the turn; its ``accepted`` is None where nothing is asked for.
+        """
+        s, self.number = self.settings, self.number + 1
+        self.steps.plan(screen=1, fit=s.rivals + s.finalists + 2)
+        asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed)
+        candidates = self.steps(
+            "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
+        )
+        wanted = [c for c in candidates if c.evidence > needed(candidates, s)]
+        rivals = leaders(wanted, s.rivals)
+        if not rivals:
+            return Turn(candidates, grown=grown)
+        jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
+        for c in rivals:
+            jobs.append((f"going on with {c.name}", c, partial(self._warm, fit, [c])))
+        warm, *tried = self._trials(fit, jobs)
+        last = finalists(tried, s.finalists)
+        self.steps.plan(fit=len(last) + 1)
+        tried += self._trials(
+            fit,
+            [
+                (
+                    f"rebuilding the scene with {t.name}",
+                    t.candidate,
+                    partial(_rebuilt, self.rebuild, t.fit.extension, self.seed, grown),
+                )
+                for t in last
+            ],
+        )
+        asked = best_of_each(tried)
+        best = choose(asked, self.block, s.errors) if asked else None
+        won = best is not None and self._beats(best, warm) and best.gain.nats > s.errors * best.gain.error
+        if grown and not won:
+            return Turn(candidates, asked, grown=grown)
+        text = "rebuilding the scene by other seeds" if grown else "rebuilding the scene finer"
+        finer = partial(_rebuilt, self.rebuild, fit.extension, self.seed + 1, True)
+        controls = self._trials(fit, [(text, None, finer)])
+        trials = weighed([*asked, *controls], self.block)
+        if best is not None and won and all(self._beats(best, control) for control in controls):
+            best = next(t for t in trials if t.candidate is best.candidate)
+            group = [t.name for t in trials if t.candidate and t is not best and t.weight > s.open_share]
+            return Turn(candidates, trials, best, group, grown)
+        if not grown and controls and controls[0].gain.nats > 0:
+            return Turn(candidates, trials, controls[0], grown=grown)
+        return Turn(candidates, trials, grown=grown)
+
+    def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
+        """The same scene, gone on with more terms."""
+        again = fit.copy(begun_with(fit, extra), self.seed)
+        solve_spots(again)
+        again.run(1, steps=WARM, settle=False)
+        return solve_spots(again)
+
+    def _beats(self, trial: Trial, control: Trial) -> bool:
+        """It predicts better than more scene does, by more than the difference's error."""
+        gain = compare(control.likelihood, trial.likelihood, self.block)
+        return gain.nats > self.settings.errors * gain.error
+
+    def _trials(self, fit: SurfelFit, jobs: list[Job]) -> list[Trial]:
+        named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]
+        fits = self.steps.several("fit", named, self.settings.processes)
+        before = log_likelihood(fit, self.split.select)
+        trials = []
+        for (_, c, _), again in zip(jobs, fits, strict=True):
+            if again is not None:
+                value = log_likelihood(again, self.split.select)
+                trials.append(Trial(c, again, value, compare(before, value, self.block)))
+        return trials
+
+    def drop_needless(self, fit: SurfelFit, fine: bool) -> tuple[SurfelFit, dict[str, Comparison]]:
+        """Backward: without which terms does a rebuilt scene predict as well?
+
+        Args:
+            fit: with all accepted terms.
+            fine: how it was rebuilt.
+
+        Returns:
+            the fit without needless terms, and what each other one's absence costs.
+        """
+        losses: dict[str, Comparison] = {}
+        while True:
+            names = [e.name for e in fit.extension.effects]
+            if not names:
+                return fit, {}
+            jobs = []
+            for name in names:
+                fewer = Extension([e for e in copy_effects(fit.extension, []).effects if e.name != name])
+                key = f"without_{name}_of_{len(names)}"
+                job = partial(_rebuilt, self.rebuild, fewer, self.seed, fine)
+                jobs.append((f"rebuilding the scene without {name}", key, job))
+            self.steps.plan(fit=len(jobs))
+            rebuilt = self.steps.several("fit", jobs, self.settings.processes)
+            value = log_likelihood(fit, self.split.select)
+            losses, fits = {}, {}
+            for name, fewer_fit in zip(names, rebuilt, strict=True):
+                if fewer_fit is not None:
+                    losses[name] = compare(log_likelihood(fewer_fit, self.split.select), value, self.block)
+                    fits[name] = fewer_fit
+            needless = [n for n, loss in losses.items() if loss.nats < self.settings.errors * loss.error]
+            if not needless:
+                return fit, losses
+            fit = fits[min(needless, key=lambda n: losses[n].nats)]
+
+
+def best_of_each(trials: list[Trial]) -> list[Trial]:
+    """The better of a term's trials, the largest gain first."""
+    found: dict[str, Trial] = {}
+    for trial in sorted(trials, key=lambda t: -t.gain.nats):
+        found.setdefault(trial.name, trial)
+    return list(found.values())
+
+
+def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
+    """Trials with their weights, the largest gain first.
+
+    Args:
+        trials: of one turn.
+        block: ``[S]`` wall block of each select spot.
+    """
+    shares = weights([t.likelihood for t in trials], block)
+    found = [replace(t, weight=w) for t, w in zip(trials, shares, strict=True)]
+    return sorted(found, key=lambda t: -t.gain.nats)
+
+
+def finalists(trials: list[Trial], number: int) -> list[Trial]:
+    """With which terms the scene is built anew: those that gain most, and the one with the most evidence.
+
+    Args:
+        trials: warm ones, the most evidence first.
+        number: of those that gain most.
+
+    Returns:
+        at most one more.
+    """
+    most = sorted(trials, key=lambda t: -t.gain.nats)[:number]
+    return [t for t in trials if any(t is m for m in most) or t is trials[0]]
+
+
+def leaders(wanted: list[Candidate], number: int) -> list[Candidate]:
+    """With which terms the scene is rebuilt: the best free one, and the best effects.
+
+    Args:
+        wanted: most evidence first; below ``HOPELESS`` of the best there are no leaders.
+        number: of leaders.
+
+    Returns:
+        at most so many, most evidence first.
+    """
+    wanted = [c for c in wanted if c.evidence > HOPELESS * wanted[0].evidence]
+    free = [c for c in wanted if c.name in FREE_NAMES][:1]
+    named = [c for c in wanted if c.name not in FREE_NAMES][: number - len(free)]
+    return sorted(free + named, key=lambda c: -c.evidence)
+
+
+def choose(trials: list[Trial], block: np.ndarray, errors: float) -> Trial:
+    """The trial that gains most, or a simpler one that falls short of it by few errors only.
+
+    An effect is simpler than a free term, and fewer coefficients are simpler than more.
+
+    Args:
+        trials: with a candidate each.
+        block: ``[S]`` wall block of each select spot.
+        errors: how many.
+
+    Returns:
+        one of them.
+    """
+    best = max(trials, key=lambda t: t.gain.nats)
+
+    def near(t: Trial) -> bool:
+        short = compare(t.likelihood, best.likelihood, block)
+        return short.nats <= errors * short.error
+
+    def cost(t: Trial) -> tuple[bool, int, float]:
+        assert t.candidate is not None
+        number = 2 if t.candidate.effect.per_spot else len(t.candidate.step)
+        return t.name in FREE_NAMES, number, -t.gain.nats
+
+    return min((t for t in trials if t is best or near(t)), key=cost)
 
 
 def criticise(
@@ -425,12 +428,11 @@ def criticise(
     seed: int,
     steps: Steps | None = None,
 ) -> Findings:
-    """Find out, one after the other, which effects the capture asks for.
+    """Find out, one after the other, what the capture asks for.
 
     Args:
-        base: fitted to ``split.fit`` without effects.
-        rebuild: a fit from new seeds with the given effects, begun at their present values, and the given
-            random seed: surfels that imitated an effect do not come back.
+        base: fitted to ``split.fit`` without effects, coarse.
+        rebuild: see :class:`Loop`.
         split: of the spots.
         scan: of the capture.
         s: settings.
@@ -440,31 +442,18 @@ def criticise(
     Returns:
         base, turns and final fit.
     """
-    fit = before = base
-    turns, latest, steps = [], "", steps or Steps()
-    while True:
-        turns.append(turn(fit, rebuild, split, scan, s, seed, steps, latest))
-        best = turns[-1].accepted
-        if best is None:
+    loop = Loop(rebuild, split, scan, s, seed, steps or Steps())
+    fit, again, turns, grown = base, None, [], False
+    while len(fit.extension.effects) < s.most:
+        turns.append(loop.turn(fit, grown))
+        taken = turns[-1].accepted
+        if taken is None:
             break
-        before, fit, latest = fit, best.fit, best.name
-        if len(fit.extension.effects) == s.most:
-            last = steps(
-                "screen",
-                "screening what is left",
-                "last_screen",
-                partial(look, fit, split, scan, s, seed, latest),
-            )
-            turns.append(Turn(last.candidates, last.discrepancies, [], None, [], form=last.form))
-            break
-    if turns[-1].form is not None:
-        fit = before
-    fit = drop_needless(fit, split, s.steps, seed, steps)
-    again = None
-    if len(fit.extension.effects):
-        steps.plan(fit=1)
-        once_more = partial(_rebuilt, rebuild, fit.extension, seed + 2)
-        again = steps(
-            "fit", "rebuilding the scene once more: do the parameters come back?", "again", once_more
-        )
-    return Findings(base, fit, turns, again)
+        if taken.candidate is None:
+            again, fit, grown = fit, taken.fit, True
+            if not fit.extension.effects:
+                base = fit
+        else:
+            again, fit = None, taken.fit
+    fit, losses = loop.drop_needless(fit, grown)
+    return Findings(base, fit, turns, losses, again)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -17,7 +16,7 @@ from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings, Findings, criticise
 from nlos_lit.inference.kept import kinds
-from nlos_lit.inference.numerics import numerics
+from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import split_spots
 from nlos_lit.inference.toys import run_toys
@@ -67,22 +66,21 @@ def diagnose(
     split, scan = split_spots(capture), Scan.of(capture)
     steps = Steps(report, None if folder is None else folder / "steps", settings, kinds(scan))
     steps.share({"capture": capture, "settings": pipeline.surfels})
-    steps.plan(
-        image=image is None,
-        fit=1 + options.finalists,
-        screen=2,
-        refit=1 + options.rivals,
-        check=options.numerics,
-    )
+    steps.plan(image=image is None, fit=2 + options.rivals, screen=1)
     if image is None:
         image = steps("image", "imaging", "image", lambda: pipeline.image(capture))
     base = steps(
-        "fit", "fitting the base", "base", lambda: pipeline.fit(capture, split, image, Extension([]), seed)
+        "fit",
+        "fitting the base",
+        "base",
+        lambda: pipeline.fit(capture, split, image, Extension([]), seed, fine=False),
     )
+    scan = lit_by(base, scan)
+    steps.know(kinds(scan))
     steps.share({"counts": base.counts, "grid": base.grid, "reserve": base.reserve})
 
-    def rebuild(extension: Extension, with_seed: int) -> SurfelFit:
-        again = pipeline.fit(capture, split, image, extension, with_seed)
+    def rebuild(extension: Extension, with_seed: int, fine: bool) -> SurfelFit:
+        again = pipeline.fit(capture, split, image, extension, with_seed, fine)
         again.counts = base.counts
         return again
 
@@ -91,11 +89,5 @@ def diagnose(
     if options.toys:
         assert folder is not None, "toys are kept in a folder"
         null = run_toys(capture, base, pipeline, split, options, folder / "toys", report)
-    checks = {}
-    if options.numerics:
-        steps.plan(check=1)
-        other = found.turns[0].controls[-1] if found.turns[0].controls else None
-        vary = partial(numerics, pipeline, capture, split, image, base, seed, other)
-        checks = steps("check", "varying the numerics", "numerics", vary)
     seconds = time.perf_counter() - began + steps.earlier
-    return assemble(capture, found, split, scan, options, null, checks, name, seconds, seed), found
+    return assemble(capture, found, split, scan, options, null, name, seconds, seed), found

@@ -8,25 +8,23 @@ import torch
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
-from nlos_lit.effects import build_effects
+from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.criticise import Look
-from nlos_lit.inference.discrepancy import Discrepancy
-from nlos_lit.inference.form import Form
-from nlos_lit.inference.screen import Candidate
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.pool import Candidate
 from nlos_lit.runtime.plain_file import Kind, record
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 
 
 def kinds(scan: Scan) -> list[Kind]:
-    """How all that steps return is kept; effects are those of one ``scan``, and made by the registry."""
+    """How all that steps return is kept; effects are those of one ``scan``, and made anew by name."""
 
     def effect(parts: dict[str, Any]) -> Effect:
         return _effect(scan, **parts)
 
     return [
-        *(record(of) for of in (Look, Candidate, Discrepancy, Form, VolumeGrid, SurfelSettings)),
+        *(record(of) for of in (Candidate, VolumeGrid, SurfelSettings)),
         Kind(SurfelFit, SurfelFit.parts, SurfelFit.of_parts),
         Kind(Extension, lambda e: {"effects": list(e.effects)}, lambda parts: Extension(**parts)),
         Kind(Effect, _parts, effect),
@@ -47,7 +45,7 @@ def _parts(effect: Effect) -> dict[str, Any]:
 def _effect(
     scan: Scan, name: str, stored: dict[str, torch.Tensor], numbers: dict[str, float], moves: bool
 ) -> Effect:
-    (effect,) = build_effects([name], scan)
+    effect = next(cls for cls in [*EFFECTS, *FREE] if cls.name == name)(scan)
     own = dict(effect.named_parameters())
     if set(own) != set(stored) or set(_numbers(effect)) != set(numbers):
         raise ValueError(f"these are no values of {name}")

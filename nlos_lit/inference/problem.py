@@ -26,6 +26,8 @@ from torch import Tensor, nn
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.functional.smooth_basis import smooth_map_basis
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
@@ -66,7 +68,12 @@ class Problem:
 
 
 def build_problem(
-    model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor, with_effects: bool = True
+    model: SurfelModel,
+    extension: Extension,
+    spots: Tensor,
+    counts: Tensor,
+    with_effects: bool = True,
+    patches: int | None = None,
 ) -> Problem:
     """Nuisance columns and residual of some spots.
 
@@ -76,6 +83,8 @@ def build_problem(
         spots: ``[S]`` rows of the capture.
         counts: ``[S, T_gate]`` of them.
         with_effects: parameters of the extension's effects are nuisance, too.
+        patches: surfels that are near each other share their columns, so that there are at most as many;
+            None leaves each its own.
 
     Returns:
         the problem.
@@ -83,14 +92,15 @@ def build_problem(
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m, first = len(model), model.gate[0]
-    tilts = tilt_fields(model)
+    tilts, patch = tilt_fields(model), patches_of(model, patches or m)
+    n_patches = int(patch.max()) + 1
     size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
         with torch.no_grad():
             light.append(model.transients(model.paths(part), part, extension))
-        surfels.append(_surfel_columns(model, extension, part, light[-1], tilts))
+        surfels.append(_surfel_columns(model, extension, part, light[-1], tilts, patch))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
         if len(model.visible):
@@ -105,7 +115,7 @@ def build_problem(
     nuisance *= weight[:, None]
     residual = (counts - expected).reshape(-1) * weight
     prior = torch.zeros(nuisance.shape[1])
-    prior[2 * m : 2 * m + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
+    prior[2 * n_patches : 2 * n_patches + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
     if accepted:
         own = torch.cat([e.precision() for e in accepted])
         prior[len(prior) - len(own) :] = own
@@ -135,6 +145,12 @@ def effect_columns(
     """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
+    factors = effect.factors(spots)
+    if factors is not None:  # the same derivative at every spot, by what each coefficient adds there
+        delay = TimingJitter(effect.scan)
+        alone = effect_columns(model, whole, spots, delay, transients=transients)
+        unit = effect.amplitudes[0].scale / delay.amplitudes[0].scale
+        return (alone.view(len(spots), -1, 1) * (unit * factors)[:, None]).flatten(0, 1)
     index = list(whole.effects).index(effect)
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
     names = [
@@ -175,8 +191,8 @@ def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> 
 
 
 def acting_order(effect: Effect) -> int:
-    """Sort key: the registry's order, which is that of the light's way."""
-    return EFFECTS.index(type(effect))
+    """Sort key: the registry's order, which is that of the light's way, and free terms after it."""
+    return [*EFFECTS, *FREE].index(type(effect))
 
 
 class _Forward(nn.Module):
@@ -228,26 +244,37 @@ def _recording(model: SurfelModel, extension: Extension, spots: Tensor, transien
 
 
 def _surfel_columns(
-    model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor, tilts: Tensor
+    model: SurfelModel,
+    extension: Extension,
+    spots: Tensor,
+    transients: Tensor,
+    tilts: Tensor,
+    patch: Tensor,
 ) -> Tensor:
     """``[B·T_gate, P]`` derivatives of the expected counts by all surfels' parameters."""
     jacobian = _record_jacobian(model, extension, spots, transients)
-    return torch.bmm(jacobian, _transient_columns(model, extension, spots, tilts)).flatten(0, 1)
+    return torch.bmm(jacobian, _transient_columns(model, extension, spots, tilts, patch)).flatten(0, 1)
 
 
 @torch.no_grad()
 def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
-    """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), for any response, gain and counting stage."""
+    """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), for any gain and counting stage.
+
+    The response is the same at all spots and linear: it is worked out once.
+    """
     b, t = transients.shape
-    repeated, again = transients.repeat_interleave(t, 0), spots.repeat_interleave(t)
-    unit = torch.eye(t).repeat(b, 1)
-    rows = torch.func.jvp(lambda x: model.record(x, again, extension), (repeated,), (unit,))[1]
+    signal = model.signal(transients, extension).repeat_interleave(t, 0)
+    unit = model.signal(torch.eye(t), extension).repeat(b, 1)
+    again = spots.repeat_interleave(t)
+    rows = torch.func.jvp(lambda x: model.detect(x, again, extension), (signal,), (unit,))[1]
     return rows.view(b, t, t)[:, :, model.gate[0] :].transpose(1, 2)
 
 
 @torch.no_grad()
-def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor) -> Tensor:
-    """``[B, T, 2M + 2F]`` derivatives of the transients.
+def _transient_columns(
+    model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor, patch: Tensor
+) -> Tensor:
+    """``[B, T, 2N + 2F]`` derivatives of the transients.
 
     By albedos (in units of themselves), depths (in bins) and tilts.
     """
@@ -277,21 +304,53 @@ def _transient_columns(model: SurfelModel, extension: Extension, spots: Tensor, 
         values = d_energy[..., None] * weights
         if k:
             values = values + (energy * d_time)[..., None] * spline_slopes(time)
-        dense = _scatter_surfels(values, first, model.n_bins)
-        blocks.append(dense if k < 2 else dense @ tilts)
+        if k < 2:
+            blocks.append(_scatter_columns(values, first, model.n_bins, patch))
+        else:
+            every = torch.arange(len(model))
+            blocks.append(_scatter_columns(values, first, model.n_bins, every) @ tilts)
     return torch.cat(blocks, 2)
 
 
-def _scatter_surfels(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
-    """``[B, T, M]`` from ``[B, M, Q, 4]`` values that start at bins ``first`` ``[B, M, Q]``."""
-    b, m = first.shape[:2]
+def _scatter_columns(values: Tensor, first: Tensor, n_bins: int, column: Tensor) -> Tensor:
+    """``[B, T, N]`` from ``[B, M, Q, 4]`` values that start at bins ``first`` ``[B, M, Q]``.
+
+    ``column`` ``[M]`` says to which of N columns each surfel adds.
+    """
+    b, m = len(first), int(column.max()) + 1
     pad = 4
     start = (first.clamp(-pad, n_bins) + pad) + (n_bins + 2 * pad) * torch.arange(b)[:, None, None]
     flat = torch.zeros(b * (n_bins + 2 * pad) * m)
-    column = torch.arange(m)[:, None]
     for k in range(4):
-        flat.index_add_(0, ((start + k) * m + column).reshape(-1), values[..., k].reshape(-1))
+        flat.index_add_(0, ((start + k) * m + column[:, None]).reshape(-1), values[..., k].reshape(-1))
     return flat.view(b, n_bins + 2 * pad, m)[:, pad:-pad]
+
+
+def patches_of(model: SurfelModel, most: int) -> Tensor:
+    """Surfels in groups that lie together: halved along their widest side until there are enough.
+
+    Args:
+        model: of the surfels.
+        most: groups, at most.
+
+    Returns:
+        ``[M]`` number of each surfel's group.
+    """
+    place = model.centre().detach()
+    if most >= len(place):
+        return torch.arange(len(place))
+    groups = [torch.arange(len(place))]
+    while 2 * len(groups) <= most:
+        halves: list[Tensor] = []
+        for rows in groups:
+            widest = int((place[rows].amax(0) - place[rows].amin(0)).argmax())
+            order = rows[place[rows, widest].argsort()]
+            halves += order.tensor_split(2)
+        groups = halves
+    patch = torch.empty(len(place), dtype=torch.long)
+    for number, rows in enumerate(groups):
+        patch[rows] = number
+    return patch
 
 
 def tilt_fields(model: SurfelModel) -> Tensor:

@@ -38,48 +38,84 @@ class Gain:
 
 
 @dataclass(frozen=True)
+class Shape:
+    """What a free term looks like along its axis, or over the wall, or over time and another axis.
+
+    Args:
+        unit: of the values: ``1`` (logarithm of a factor) or ``m`` (a delay).
+        edges: ``[K + 1]`` of the axis, or of the first of two; bins, spots in order of acquisition, metres on
+            the wall, or counts.
+        values: ``[K]`` or ``[K1, K2]``.
+        edges_y: ``[K2 + 1]`` of the second axis.
+    """
+
+    axis: str
+    unit: str
+    edges: np.ndarray
+    values: np.ndarray
+    edges_y: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
 class Accepted:
-    """An effect that the model was extended with."""
+    """A term that the model was extended with: an effect of the registry, or a free term.
+
+    Args:
+        evidence: nats in the pool when it was asked for, log Bayes factor against none.
+        heldout_gain: on spots that were not fitted.
+        weights: how far the capture leaves open which term is meant, by name, the term itself among them;
+            what weighs too little is left out.
+        split_by: the measurement that would tell those apart.
+        axis: of a free term, else empty.
+        shape: of a free term.
+    """
 
     name: str
     parameters: dict[str, Estimate]
-    statistic: float
-    p_value: float
+    evidence: float
     heldout_gain: Gain
-    confusable_with: list[str] = field(default_factory=list)
+    weights: dict[str, float] = field(default_factory=dict)
     split_by: str = ""
+    axis: str = ""
+    shape: Shape | None = None
+
+    @property
+    def confusable_with(self) -> list[str]:
+        """Other names that this capture leaves open."""
+        return [name for name in self.weights if name != self.name]
 
 
 @dataclass(frozen=True)
 class Screened:
-    """One effect's score test at its null, against the base.
+    """One term as the pool sees it at its null, beside the base.
 
-    ``predicted_gain`` (nats, cross-validated over wall blocks) ranks; ``one_step`` are estimated parameters,
-    ``shape`` the scanned ones; ``detectable`` is the smallest amplitude of each parameter that this capture
-    would reveal (statistic 25). ``expected``: statistic without the effect, on average: degrees of freedom,
-    or what toys show where that is more.
+    Args:
+        evidence: nats.
+        retained_information: share of its information that scene and response cannot imitate.
+        scatter: how much more its scores scatter between wall blocks than counts do; 1 where they do not.
+        degrees: coefficients.
+        one_step: estimated parameters. shape: scanned ones.
+        detectable: the smallest amplitude of each parameter that this capture would reveal in nine of ten
+            cases.
     """
 
     name: str
-    statistic: float
-    p_value: float
+    evidence: float
     retained_information: float
+    scatter: float
     degrees: int
-    predicted_gain: float
     one_step: dict[str, float]
     shape: dict[str, float]
     detectable: dict[str, float]
-    expected: float
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is still wrong after all accepted effects, and along which axis it shows."""
+    """What no effect of the registry explains: the axis of the free term that holds most of it."""
 
     significant: bool
     axis: str
-    statistic: float
-    p_value: float
+    evidence: float
 
 
 @dataclass(frozen=True)
@@ -100,9 +136,19 @@ class Profile:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Everything that ``diagnose.py`` found."""
+    """Everything that ``diagnose.py`` found.
+
+    Args:
+        effects: of the registry, that the model was extended with, in that order.
+        unknown: free terms that it was extended with.
+        groups: names that the capture cannot tell apart, an accepted effect first.
+        needed: nats of evidence that a term of this pool needed.
+        chance: of evidence as large as the largest, without any effect: counted over ``toys``; without toys
+            what the theory says.
+    """
 
     effects: list[Accepted]
+    unknown: list[Accepted]
     groups: list[list[str]]
     unexplained: Unexplained
     screened: list[Screened]
@@ -111,7 +157,8 @@ class Diagnosis:
     untouched_test: dict[str, Scores]  # "base", "extended"
     witness: dict[str, Any] | None
     profiles: list[Profile]
-    numerics: dict[str, float]
+    needed: float
+    chance: float
     notes: list[str]
     capture: dict[str, Any]
     toys: int

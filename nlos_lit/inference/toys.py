@@ -1,10 +1,8 @@
-"""The null distribution by toys: draw counts from the fitted base, go through the whole pipeline again,
-screen again.
+"""What the pipeline itself does to captures without effects: draw counts from the fitted base, go through the
+whole pipeline again, ask the pool again.
 
-What the pipeline itself does to a capture without effects (seeds, surfels that stay or die, an optimiser that
-stops) then counts as noise. A statistic is judged against a gamma distribution with the mean and variance of
-its toys, and against χ²: the larger p counts. On a bright capture a base leaves something like a slow tail
-every time, 190 ± 65 where χ² expects 1: no stretched χ² is so narrow.
+One number is kept of each toy, the largest evidence over the pool, and the chance that is reported is
+counted: (1 + toys with as much)/(1 + toys).
 """
 
 from __future__ import annotations
@@ -16,58 +14,44 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from scipy import stats
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.inference.criticise import CriticismSettings, look
-from nlos_lit.inference.screen import Candidate
+from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.pool import ask
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Report
 from nlos_lit.surfels.fit import SurfelFit
 
-FEW = 10
 Pipeline = Callable[[Capture, Split, int], SurfelFit]
 
 
 @dataclass(frozen=True)
 class Null:
-    """The null distribution of the screening's statistics.
+    """The null distribution of the largest evidence.
 
     Args:
-        toys: how many there were.
-        moments: mean and variance of each effect's statistic.
-        largest: largest predicted gain of each toy, nats.
+        largest: of each toy, nats.
     """
 
-    toys: int
-    moments: dict[str, tuple[float, float]]
     largest: list[float]
 
-    def expected(self, candidate: Candidate) -> float:
-        """Mean statistic without the effect, at least its degrees of freedom."""
-        return max(float(candidate.degrees), self.moments.get(candidate.effect.name, (0.0, 0.0))[0])
+    @property
+    def toys(self) -> int:
+        return len(self.largest)
 
-    def p_value(self, candidate: Candidate) -> float:
-        """Of the gamma distribution or of χ², whichever is larger.
+    def chance(self, evidence: float) -> float:
+        """Of so much evidence without any effect; n toys know no chance below 1/(n + 1).
 
-        A toy's statistic is that of its best shape, too. Fewer toys than ``FEW`` do not settle a variance: it
-        is then at least that of a χ² with the same mean.
+        Examples:
+            >>> Null([0.5, 3.0, 1.0]).chance(2.0)
+            0.5
         """
-        mean, variance = self.moments.get(candidate.effect.name, (0.0, 0.0))
-        if self.toys < FEW:
-            variance = max(variance, 2 * mean**2 / candidate.degrees)
-        if variance == 0 or mean <= 0:
-            return candidate.p_value
-        return max(
-            candidate.p_value,
-            float(stats.gamma.sf(candidate.statistic, mean**2 / variance, scale=variance / mean)),
-        )
+        return (1 + sum(value >= evidence for value in self.largest)) / (1 + self.toys)
 
 
 def toy_capture(capture: Capture, fit: SurfelFit, seed: int) -> Capture:
@@ -97,7 +81,7 @@ def run_toys(
     store: Path,
     report: Report,
 ) -> Null:
-    """Draw toys from the fit and screen each after its own fit, several at a time in other processes.
+    """Draw toys from the fit and ask the pool about each after its own fit, several at a time.
 
     Each is kept as it is done, so that interrupted work goes on.
 
@@ -143,20 +127,13 @@ def read_toys(files: list[Path]) -> Null:
     Raises:
         UserError: a file is damaged or foreign.
     """
-    results = [_read_toy(file) for file in files]
-    drawn = {n: np.array([r["statistic"][n] for r in results]) for n in results[0]["statistic"]}
-    moments = {n: (float(v.mean()), float(v.var(ddof=1)) if len(v) > 1 else 0.0) for n, v in drawn.items()}
-    return Null(len(results), moments, [r["largest"] for r in results])
+    return Null([_read_toy(file) for file in files])
 
 
-def _read_toy(file: Path) -> dict[str, Any]:
+def _read_toy(file: Path) -> float:
     try:
-        found = json.loads(file.read_text())
-        return {
-            "statistic": {str(name): float(value) for name, value in found["statistic"].items()},
-            "largest": float(found["largest"]),
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return float(json.loads(file.read_text())["largest"])
+    except (ValueError, KeyError, TypeError) as error:
         raise UserError(f"{file} is damaged, or holds no toy: move it away") from error
 
 
@@ -165,11 +142,7 @@ def _toy(
 ) -> None:
     torch.set_num_threads(1)
     fit = pipeline(capture, split, seed)
-    candidates = look(fit, split, Scan.of(capture), settings, seed).candidates
-    result = {
-        "statistic": {c.effect.name: c.statistic for c in candidates},
-        "largest": max(c.gain for c in candidates),
-    }
+    pool = ask(fit, split, Scan.of(capture), settings.spots, seed)
     part = store / f".toy_{seed}.json"
-    part.write_text(json.dumps(result))
+    part.write_text(json.dumps({"largest": pool[0].evidence, "term": pool[0].name}))
     part.rename(store / f"toy_{seed}.json")

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from nlos_lit.effects.effect import Effect
-from nlos_lit.inference.joint_step import shift
+from nlos_lit.inference.evidence import Projector
+from nlos_lit.inference.pool import patches_for
 from nlos_lit.inference.problem import build_problem, weighted_columns
 from nlos_lit.inference.result import Estimate
-from nlos_lit.inference.screen import Projector
 from nlos_lit.surfels.fit import SurfelFit
 
 REACH = 3.0  # standard errors over which quantities are displaced
@@ -39,7 +39,9 @@ class Uncertainty:
         self.effects = [e for e in fit.extension.effects if not e.per_spot]
         if not self.effects:
             return
-        problem = build_problem(fit.model, fit.extension, spots, counts, with_effects=False)
+        problem = build_problem(
+            fit.model, fit.extension, spots, counts, with_effects=False, patches=patches_for(counts.numel())
+        )
         projector = Projector(problem)
         z = projector.off(torch.cat([weighted_columns(problem, e, shapes=True) for e in self.effects], 1))
         information = (z.T @ z).double() + torch.diag(
@@ -90,7 +92,7 @@ class Uncertainty:
 def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
     """Quantities with all stored values moved by ``step``, without regard to bounds."""
     moved = copy.deepcopy(effect)
-    shift(moved, step, shapes=True)
+    moved.shift(step, shapes=True)
     return _values(moved)
 
 

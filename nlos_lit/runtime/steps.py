@@ -19,7 +19,7 @@ T = TypeVar("T")
 SETTINGS = "settings.json"
 Report = Callable[[str, float, float], None]
 # What a step takes, in base fits, until one of its kind has been timed.
-SHARE = {"image": 0.3, "fit": 1.0, "screen": 1.0, "refit": 0.3, "check": 1.0}
+SHARE = {"image": 0.3, "fit": 1.0, "screen": 1.0}
 
 
 class Kept(NamedTuple):
@@ -53,7 +53,7 @@ class Steps:
         kinds: Sequence[Kind] = (),
     ) -> None:
         self.report, self.folder, self.settings = report, folder, settings
-        self.kinds = [record(Kept), *kinds]
+        self.know(kinds)
         made_with = None if folder is None else folder / SETTINGS
         if made_with is not None and made_with.exists() and made_with.read_text() != settings:
             raise UserError(
@@ -64,6 +64,10 @@ class Steps:
         self.began, self.ahead = time.monotonic(), dict.fromkeys(SHARE, 0)
         self.taken: dict[str, list[float]] = {}
         self.earlier = 0.0  # seconds that kept results took when they were made
+
+    def know(self, kinds: Sequence[Kind]) -> None:
+        """From now on results hold objects of these kinds."""
+        self.kinds = [record(Kept), *kinds]
 
     def share(self, objects: Mapping[str, Any]) -> None:
         """Name large objects that every result refers to.

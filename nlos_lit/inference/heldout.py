@@ -1,16 +1,15 @@
-"""Refits of the whole model together with effects, and what they bring on spots that were not fitted."""
+"""What fits are worth on spots that took part in none of them."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from nlos_lit.inference.joint_step import best_start
-from nlos_lit.inference.per_spot import factors, solve, sparse, spot_scores
-from nlos_lit.inference.screen import Candidate
+from nlos_lit.inference.per_spot import factors, sparse, spot_scores
 from nlos_lit.metrics.transients import Scores
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.surfels.fitted import score_spots
@@ -31,35 +30,6 @@ class Comparison:
     nats: float
     error: float
     interval: tuple[float, float]
-
-
-def refit_with(
-    fit: SurfelFit, candidates: list[Candidate], steps: int, seed: int, beside: Tensor | None = None
-) -> SurfelFit:
-    """Warm-started joint refit with more effects (none: the control), begun at their one-step estimates.
-
-    Args:
-        fit: that is copied.
-        candidates: whose effects are added.
-        steps: batches (and as many again at falling rate).
-        seed: of the batches.
-        beside: ``[P]`` what the base does at the same time; None takes that of a single candidate, and
-            nothing for several.
-
-    Returns:
-        the refitted copy.
-    """
-    if beside is None and len(candidates) == 1:
-        beside = candidates[0].beside
-    again = best_start(fit, [c.effect for c in candidates], [c.step for c in candidates], beside, seed)
-    random = [e for e in again.extension.effects if e.per_spot]
-    for effect in random:  # solved spot by spot: random batches would visit each number a few times only
-        effect.requires_grad_(False)
-        solve(again.model, again.extension, effect, again.train, again.counts)
-    again.run(1, steps=steps, settle=False)
-    for effect in random:
-        solve(again.model, again.extension, effect, again.train, again.counts)
-    return again
 
 
 def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
@@ -108,6 +78,33 @@ def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> 
     sums = gain[draws].sum(1)
     low, high = np.quantile(sums, (0.025, 0.975))
     return Comparison(float(gain.sum()), float(sums.std(ddof=1)), (float(low), float(high)))
+
+
+def weights(likelihoods: Sequence[Tensor], block: np.ndarray, seed: int = 0) -> list[float]:
+    """How far the wall blocks leave open which of several models predicts best.
+
+    Pseudo-Bayesian model averaging over Dirichlet weights of the blocks (Y. Yao, A. Vehtari, D. Simpson,
+    A. Gelman, *Bayesian Analysis* 13, 2018): the mean posterior share of each, had other blocks been drawn.
+
+    Args:
+        likelihoods: ``[S]`` nats of the same spots, one for each model.
+        block: ``[S]`` wall block of each spot.
+        seed: of the draws.
+
+    Returns:
+        one weight a model; they sum to 1.
+
+    Examples:
+        >>> same = torch.tensor([1.0, 1.0, 2.0, 2.0])
+        >>> [round(w, 2) for w in weights([same, same - 9], np.array([0, 0, 1, 1]))]
+        [1.0, 0.0]
+    """
+    names, index = np.unique(block, return_inverse=True)
+    table = np.zeros((len(names), len(likelihoods)))
+    np.add.at(table, index, torch.stack(list(likelihoods), 1).numpy())
+    drawn = len(names) * np.random.default_rng(seed).dirichlet(np.ones(len(names)), BOOTSTRAP) @ table
+    shares = np.exp(drawn - drawn.max(1, keepdims=True))
+    return (shares / shares.sum(1, keepdims=True)).mean(0).tolist()
 
 
 def score(fit: SurfelFit, spots: np.ndarray) -> Scores:

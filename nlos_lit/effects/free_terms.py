@@ -1,0 +1,358 @@
+"""Free terms: what is wrong along an axis, whatever causes it (after Kennedy and O'Hagan, 2001).
+
+A free term is an effect without a name: its coefficients may take any values along one axis or a pair of
+axes, each with the same prior deviation. It stands in the same contest as the effects of the registry, can be
+fitted, shown and measured like them, and says where to look when no equation fits.
+
+    f = Σ_k c_k b_k,    counts → counts · e^f   or   background → background · e^f   or   L → L + f
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.smooth import length, over_wall
+from nlos_lit.effects.words import EffectWords
+from nlos_lit.functional.surfel_paths import Paths
+
+TAILS = (4.0, 12.0, 36.0)  # bins
+RATES = (-2.0, 2.0)  # natural logarithm of a spot's counts over the scan's mean
+
+
+def _words(where: str, what: str) -> EffectWords:
+    return EffectWords(
+        phrase=f"something unknown {where}",
+        cause=f"{what} No equation of the registry has this form.",
+        remedy="Look at its shape in the residual; if it follows a formula, that is a new effect file.",
+        headline="{rms} rms",
+    )
+
+
+class Free(Effect):
+    """Any free term.
+
+    Attributes:
+        axis: ``time``, ``wall``, ``scan``, ``rate``, ``spot`` or two of them with ``×``.
+    """
+
+    axis: ClassVar[str]
+
+    def values(self) -> Tensor:
+        """f at every spot ``[S]``, in every bin ``[T]``, at every knot of the rate, or ``[S, T]``."""
+        raise NotImplementedError
+
+
+class FreeTerm(Free):
+    """Coefficients along an axis; subclasses give the functions and one hook."""
+
+    functions: Tensor
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.register_buffer("functions", self.basis(scan), persistent=False)
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        """``[n, K]`` functions of the spot, or of the bin."""
+        raise NotImplementedError
+
+    @classmethod
+    def size(cls, scan: Scan) -> int:
+        """How many coefficients there are."""
+        return cls.basis(scan).shape[1]
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        k = cls.size(scan)
+        return (Parameter("field", "1", 0.0, 0.05, -3.0, 3.0, size=k, prior=(0.5,) * k, kind="percent"),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"field": 0.2}
+
+    def values(self) -> Tensor:
+        return self.functions @ self.value("field").reshape(-1)
+
+    def quantities(self) -> dict[str, Quantity]:
+        p, field = self.declared["field"], self.values()
+        return {"rms": Quantity(length(field / field.numel() ** 0.5, p.scale), p.unit, kind=p.kind)}
+
+
+class FreeTime(FreeTerm):
+    """``m_t → m_t e^{f(t)}``, f constant within each of 40 bands of the gate."""
+
+    name, axis = "free_time", "time"
+    words = _words("along the time axis", "All spots count too much or too little in the same bins.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return time_bands(scan, 40)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.values())
+
+
+class FreeWall(FreeTerm):
+    """``m → m e^{f(x, y)}``, f any combination of 8×8 splines over the wall."""
+
+    name, axis = "free_wall", "wall"
+    words = _words("across the wall", "Spots of one region count too much or too little.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 8)[0]
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
+
+class FreeLines(FreeTerm):
+    """``m → m e^{f(x) + g(y)}``, f and g constant within each of 24 stripes of the wall."""
+
+    name, axis = "free_lines", "wall"
+    words = _words("along rows or columns of the wall", "Whole rows or columns count too much or too little.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        place = scan.places[-1]
+        return torch.cat([bands((place[:, k] + 1) / 2, 24) for k in (0, 1)], 1)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
+
+class FreeScan(FreeTerm):
+    """``m → m e^{f(u)}``, f constant within each of 64 stretches of the scan."""
+
+    name, axis = "free_scan", "scan"
+    words = _words(
+        "over the course of the scan", "Spots of one stretch of time count too much or too little."
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return bands((scan.rank + 1) / 2, 64)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
+
+class FreeRate(FreeTerm):
+    """``m → m e^{f(ln n)}``, n the spot's expected counts, f linear between 10 knots."""
+
+    name, axis = "free_rate", "rate"
+    words = _words(
+        "with the count rate", "Bright spots count too much or too little, whatever makes them so."
+    )
+    KNOTS = 10
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return torch.eye(cls.KNOTS)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        rate = (expected.sum(1) / self.scan.mean_counts).clamp_min(1e-6).log()
+        place = (rate - RATES[0]) / (RATES[1] - RATES[0]) * (self.KNOTS - 1)
+        knots = torch.arange(self.KNOTS, device=expected.device)
+        tents = (1 - (place.clamp(0, self.KNOTS - 1)[:, None] - knots).abs()).clamp_min(0)
+        return expected * torch.exp(tents @ self.value("field").reshape(-1))[:, None]
+
+
+class FreeScanBackground(FreeTerm):
+    """``background → background e^{f(u)}``, f constant within each of 64 stretches of the scan."""
+
+    name, axis = "free_scan_background", "scan"
+    words = _words(
+        "in the background over the course of the scan", "Light that is not the scene's comes and goes."
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return bands((scan.rank + 1) / 2, 64)
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        return background * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
+
+class FreeWallBackground(FreeTerm):
+    """``background → background e^{f(x, y)}``, f any combination of 8×8 splines over the wall."""
+
+    name, axis = "free_wall_background", "wall"
+    words = _words(
+        "in the background across the wall", "Light that is not the scene's depends on the wall point."
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 8)[0]
+
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        return background * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
+
+class _FreeDelay(FreeTerm):
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        k, step = cls.size(scan), scan.bin_length
+        return (Parameter("field", "m", 0.0, step, -20 * step, 20 * step, size=k, prior=(step,) * k),)
+
+    def factors(self, spots: Tensor) -> Tensor:
+        return self.functions[spots]
+
+    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+        return length + (self.functions[spots] @ self.value("field").reshape(-1))[:, None, None]
+
+
+class FreeScanDelay(_FreeDelay):
+    """``L → L + f(u)``, f constant within each of 24 stretches of the scan."""
+
+    name, axis = "free_scan_delay", "scan"
+    words = _words(
+        "in the delay over the course of the scan", "Light comes early or late in one stretch of time."
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return bands((scan.rank + 1) / 2, 24)
+
+
+class FreeWallDelay(_FreeDelay):
+    """``L → L + f(x, y)``, f any combination of 6×6 splines over the wall."""
+
+    name, axis = "free_wall_delay", "wall"
+    words = _words("in the delay across the wall", "Light comes early or late at one region of the wall.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 6)[0]
+
+
+class _FreeResponse(FreeTerm):
+    """``signal → signal + Σ_ij c_ij b_j(spot) K_i signal``: what response and spot do together.
+
+    K_0 widens (a second difference), K_1 … K_3 move light into tails that decay over 4, 12 and 36 bins; all
+    keep the energy. A scene changes what arrives at a spot in any way it likes, but never smears all of it.
+    """
+
+    kernels: Tensor
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.register_buffer("kernels", response_changes(scan.n_bins), persistent=False)
+
+    @classmethod
+    def size(cls, scan: Scan) -> int:
+        return (1 + len(TAILS)) * cls.basis(scan).shape[1]
+
+    def _weights(self) -> Tensor:
+        """``[K_spot, 4]`` coefficients."""
+        return self.value("field").reshape(self.functions.shape[1], -1)
+
+    def values(self) -> Tensor:
+        """``[S, T]`` what becomes of light that arrives when the gate opens."""
+        return self.functions @ self._weights() @ self.kernels[:, :, self.scan.gate[0]]
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        weights = self.functions[spots] @ self._weights()
+        changed = torch.einsum("ktu,bu->bkt", self.kernels, signal)
+        return (signal + torch.einsum("bk,bkt->bt", weights, changed)).clamp_min(0)
+
+
+class FreeResponseScan(_FreeResponse):
+    """The response changes over the scan: b_j 16 stretches of it."""
+
+    name, axis = "free_response_scan", "time×scan"
+    words = _words("along time that changes over the scan", "The response drifts, or comes and goes.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return bands((scan.rank + 1) / 2, 16)
+
+
+class FreeResponseWall(_FreeResponse):
+    """The response depends on the wall point: b_j the 8 smoothest functions of it without a constant."""
+
+    name, axis = "free_response_wall", "time×wall"
+    words = _words("along time that depends on the wall point", "The response is not the same everywhere.")
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 5)[0][:, :8]
+
+
+class FreeSpotGain(Free):
+    """``m → m e^{δ_s}``, ``δ_s ~ N(0, σ²)``, independent."""
+
+    name, axis = "free_spot_gain", "spot"
+    words = _words(
+        "in the gain of single spots", "Each spot counts too much or too little, unlike its neighbours."
+    )
+    per_spot = True
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        return (Parameter("field", "1", 0.0, 0.05, -3.0, 3.0, size=scan.n_spots, kind="percent"),)
+
+    @classmethod
+    def typical(cls, scan: Scan) -> dict[str, float]:
+        return {"field": 0.1}
+
+    def values(self) -> Tensor:
+        return self.value("field").reshape(-1)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.values()[spots])[:, None]
+
+    def quantities(self) -> dict[str, Quantity]:
+        p = self.declared["field"]
+        return {"rms": Quantity(self.value("field").new_tensor(self.width * p.scale), p.unit, kind=p.kind)}
+
+
+def bands(place: Tensor, number: int) -> Tensor:
+    """``[n, number]`` one where a place in [0, 1] lies in the band, else zero.
+
+    Examples:
+        >>> bands(torch.tensor([0.0, 0.6, 1.0]), 2)
+        tensor([[1., 0.],
+                [0., 1.],
+                [0., 1.]])
+    """
+    index = (place * number).long().clamp(0, number - 1)
+    return torch.nn.functional.one_hot(index, number).float()
+
+
+def response_changes(n_bins: int) -> Tensor:
+    """``[4, T, T]`` what widening and three tails add to light, see :class:`_FreeResponse`.
+
+    Examples:
+        Light of one bin is spread to both sides, and its energy kept:
+
+        >>> response_changes(5)[0, :, 2]
+        tensor([ 0.,  1., -2.,  1.,  0.])
+    """
+    late = (torch.arange(n_bins)[:, None] - torch.arange(n_bins)).float()
+    changes = [(late.abs() == 1).float() - 2 * (late == 0).float()]
+    for tail in TAILS:
+        decay = torch.exp(-late.clamp_min(0) / tail) * (late >= 0)
+        changes.append(decay * (1 - torch.exp(torch.tensor(-1 / tail))) - (late == 0).float())
+    return torch.stack(changes)
+
+
+def time_bands(scan: Scan, number: int) -> Tensor:
+    """``[T, number]`` bands of equal width over the gate; nothing before it."""
+    first, last = scan.gate
+    place = (torch.arange(scan.n_bins) - first) / (last - first)
+    return bands(place, number) * (place >= 0)[:, None]
+
+
+FREE: tuple[type[Free], ...] = (
+    FreeScanDelay, FreeWallDelay, FreeScanBackground, FreeWallBackground, FreeTime, FreeWall, FreeLines,
+    FreeScan, FreeRate, FreeResponseScan, FreeResponseWall, FreeSpotGain,
+)  # fmt: skip
+FREE_NAMES = frozenset(term.name for term in FREE)

@@ -1,0 +1,172 @@
+"""How much the counts ask for a term of the model, after all that the scene can do itself: one number in nats
+for a scalar, a map, a number for each spot and a free axis.
+
+With weighted columns ``X`` (scene, response, effects that are there), ``Z`` (the term) and residual ``r``
+(:mod:`nlos_lit.inference.problem`), all projected off X, the term's coefficients c ~ N(0, τ²C) have the log
+Bayes factor against none
+
+    ½ Σ_i [τ² w_i / (1 + τ² λ_i) - ln(1 + τ² λ_i)],
+
+λ_i the eigenvalues of the information ``C^½ Z⊥ᵀZ⊥ C^½``, w_i the squares of the scores in its eigenbasis. τ
+is where it is largest (type-II likelihood; M. Tipping, *JMLR* 1, 2001). Scanned shapes are equally likely
+beforehand, so that the mean of their Bayes factors counts. A single coefficient that cannot be negative is
+half normal.
+
+A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i between
+wall blocks, where it exceeds that of counts, divides w_i (the sandwich of P. Huber, 1967, and of K.-Y. Liang
+and S. Zeger, *Biometrika* 73, 1986).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlos_lit.effects.effect import Effect
+from nlos_lit.inference.problem import Problem
+
+VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
+
+
+class Projector:
+    """Takes from any columns what the base can explain by itself."""
+
+    def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
+        x = problem.nuisance
+        gram = half_products(x).double()
+        if not bool(torch.isfinite(gram).all()):
+            raise ValueError("the model's sensitivities are not finite: this fit cannot be criticised")
+        diagonal = gram.diagonal().clone().clamp_min(float(gram.diagonal().mean()) * 1e-6)
+        failed = 1
+        while failed:  # single-precision products of nearly dependent columns may need more
+            self.factor, failed = torch.linalg.cholesky_ex(
+                gram + torch.diag(problem.prior.double() + ridge * diagonal)
+            )
+            ridge *= 10
+        self.nuisance = x
+        self.residual = self.off(problem.residual[:, None])[:, 0]
+
+    def off(self, columns: Tensor) -> Tensor:
+        """``columns`` ``[N, k]`` without their projection on the nuisance."""
+        weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
+        return columns - self.nuisance @ weights
+
+
+def half_products(x: Tensor, block: int = 512) -> Tensor:
+    """``xᵀx`` with little more than half of its multiplications, which are most of a screening's work.
+
+    Args:
+        x: ``[N, P]``.
+        block: columns at a time.
+
+    Returns:
+        ``[P, P]``.
+
+    Examples:
+        >>> half_products(torch.tensor([[1.0, 2.0], [3.0, 4.0]]), block=1)
+        tensor([[10., 14.],
+                [14., 20.]])
+    """
+    gram = x.new_empty(x.shape[1], x.shape[1])
+    for start in range(0, x.shape[1], block):
+        part = x[:, start:].T @ x[:, start : start + block]
+        gram[start:, start : start + block] = part
+        gram[start : start + block, start:] = part.T
+    return gram
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What one term at one shape is worth.
+
+    Args:
+        nats: log Bayes factor against no such term; -inf is never reached, τ = 0 gives 0.
+        scale: τ.
+        step: ``[k]`` posterior mean of the stored amplitudes' change.
+        error: ``[k]`` its standard deviation by counts alone.
+        retained: share of the term's information that the base cannot imitate.
+        scatter: φ, mean over the directions weighted by their scores.
+    """
+
+    nats: float
+    scale: float
+    step: Tensor = field(repr=False)
+    error: Tensor = field(repr=False)
+    retained: float = 1.0
+    scatter: float = 1.0
+
+
+def prior_deviations(effect: Effect) -> Tensor:
+    """``[k]`` deviations C^½ of the stored amplitudes at τ = 1: of their prior, else a noticeable step."""
+    precision = effect.precision()[: sum(p.size for p in effect.amplitudes)]
+    unit = precision.double() * effect.prior_scale**2
+    return torch.where(unit > 0, unit.clamp_min(1e-30).rsqrt(), torch.ones_like(unit))
+
+
+def positive(effect: Effect) -> bool:
+    """Its one coefficient cannot be negative."""
+    return len(effect.amplitudes) == 1 and effect.amplitudes[0].lower == effect.amplitudes[0].null
+
+
+def evidence(
+    raw: Tensor, z: Tensor, residual: Tensor, block: Tensor, deviation: Tensor, one_sided: bool = False
+) -> Evidence:
+    """The log Bayes factor of a term.
+
+    Args:
+        raw: ``[S, T, k]`` weighted columns.
+        z: the same with the base projected off.
+        residual: ``[S, T]``, projected.
+        block: ``[S]`` number of each spot's wall block.
+        deviation: ``[k]`` C^½.
+        one_sided: the one coefficient is half normal.
+
+    Returns:
+        what the counts say of it.
+    """
+    z = z * deviation.float()
+    score = torch.einsum("stk,st->sk", z, residual).double()
+    information = torch.einsum("stk,stl->skl", z, z).double()
+    blocks = int(block.max()) + 1
+    s = score.new_zeros(blocks, score.shape[1]).index_add_(0, block, score)
+    f = score.new_zeros(blocks, *information.shape[1:]).index_add_(0, block, information)
+    values, vectors = torch.linalg.eigh(f.sum(0))
+    values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
+    u = s.sum(0) @ vectors
+    w = u.square()
+    tried = torch.from_numpy(VARIANCES)[:, None]
+
+    def best(w: Tensor) -> tuple[float, float]:
+        grown = 1 + tried * values
+        each = 0.5 * (tried * w / grown - grown.log())
+        if one_sided:
+            towards = u.sign() * (tried * w / grown).sqrt()
+            each = each + math.log(2) + torch.special.log_ndtr(towards)
+        gains = each.sum(1)
+        k = int(gains.argmax())
+        return float(gains[k]), float(VARIANCES[k])
+
+    _, variance = best(w)
+    mean = vectors @ (variance * u / (1 + variance * values))
+    left = (s - f @ mean) @ vectors
+    scatter = (left.square().sum(0) / values).clamp_min(1.0)
+    nats, variance = best(w / scatter)
+    if nats <= 0:
+        nats, variance = 0.0, 0.0
+    mean = variance * (vectors @ (u / scatter / (1 + variance * values / scatter)))
+    error = (vectors.square() @ (scatter / values)).sqrt()
+    whole = (raw.double().square().sum((0, 1)) * deviation**2).clamp_min(1e-30)
+    retained = float((f.sum(0).diagonal() / whole).mean())
+    share = w / values
+    return Evidence(
+        nats=nats,
+        scale=variance**0.5,
+        step=(mean * deviation).float(),
+        error=(error * deviation).float(),
+        retained=retained,
+        scatter=float((scatter * share).sum() / share.sum().clamp_min(1e-30)),
+    )

@@ -1,0 +1,234 @@
+"""One pool: every effect of the registry and every free term, each with its evidence."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.evidence import Evidence, Projector, evidence, positive, prior_deviations
+from nlos_lit.inference.per_spot import best_width, coefficients, sparse
+from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
+from nlos_lit.inference.split import Split
+from nlos_lit.surfels.fit import SurfelFit
+
+KEPT = 16  # shapes of one effect that are tested in full; the others are worth nothing beside them
+TOGETHER = 128  # columns from which on no more effects are projected along
+WORK = 5e10  # multiplications of the nuisance columns with each other, some 1 s of one core
+Shape = dict[str, float]
+Tried = tuple[Effect, list[tuple[Shape, Tensor]]]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One term of the pool, as the linear problem sees it.
+
+    Args:
+        effect: at its best shape and null amplitudes; its prior deviation is set.
+        evidence: nats, log Bayes factor against no such term.
+        retained: share of its information that the base cannot imitate.
+        scatter: how much more its scores scatter between wall blocks than counts do.
+        shape: scanned parameters.
+        step: ``[k]`` change of the stored amplitudes that the counts ask for. error: of it.
+    """
+
+    effect: Effect
+    evidence: float
+    retained: float
+    scatter: float
+    shape: Shape
+    step: Tensor = field(repr=False)
+    error: Tensor = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        return self.effect.name
+
+
+def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
+    """Which fitted spots the pool is asked on.
+
+    Args:
+        fit: that is criticised.
+        split: of its spots.
+        most: spots, at most.
+        seed: of the choice.
+
+    Returns:
+        sorted rows of ``split.fit`` (and of the fit's counts).
+    """
+    return np.sort(np.random.default_rng(seed).permutation(len(split.fit))[:most])
+
+
+def lit_by(fit: SurfelFit, scan: Scan) -> Scan:
+    """The scan with a fit's expected light in place of the counts.
+
+    Counts hold whatever a model lacks, and neighbours lack the same.
+
+    Args:
+        fit: of the base.
+        scan: of the capture.
+
+    Returns:
+        another scan.
+    """
+    expected = fit.model.expected(torch.arange(scan.n_spots), fit.extension).numpy()
+    return replace(scan, light=np.pad(expected, ((0, 0), (scan.gate[0], 0))))
+
+
+def patches_for(rows: int) -> int:
+    """How many groups of surfels the work allows, see ``WORK``.
+
+    Args:
+        rows: of the problem, spots times bins.
+
+    Examples:
+        >>> patches_for(320_000), patches_for(72_000)
+        (197, 416)
+    """
+    return int((WORK / rows) ** 0.5 / 2)
+
+
+def ask(fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int) -> list[Candidate]:
+    """Every term that the fit does not have yet, most evidence first.
+
+    Args:
+        fit: that is criticised.
+        split: of its spots.
+        scan: of the capture.
+        most: fitted spots that are looked at.
+        seed: of their choice.
+
+    Returns:
+        one candidate a term, with a copy of it at its best shape.
+    """
+    rows = tested_rows(fit, split, most, seed)
+    spots = torch.from_numpy(split.fit[rows])
+    patches = patches_for(len(rows) * fit.counts.shape[1])
+    problem = build_problem(fit.model, fit.extension, spots, fit.counts[rows], patches=patches)
+    block = torch.from_numpy(np.unique(split.block[split.fit[rows]], return_inverse=True)[1])
+    have = {e.name for e in fit.extension.effects}
+    return screen(problem, [e(scan) for e in [*EFFECTS, *FREE] if e.name not in have], block)
+
+
+def screen(problem: Problem, effects: list[Effect], block: Tensor) -> list[Candidate]:
+    """Evidence of several terms.
+
+    Args:
+        problem: of the tested spots.
+        effects: at their nulls; they stay there.
+        block: ``[S]`` number of each spot's wall block.
+
+    Returns:
+        one candidate an effect, most evidence first.
+    """
+    projector = Projector(problem)
+    effects = [copy.deepcopy(e) for e in effects]
+    found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
+    others = (e for e in effects if not e.per_spot)
+    for group in _groups((e, _worthwhile(problem, projector, e)) for e in others):
+        z = projector.off(torch.cat([columns for _, kept in group for _, columns in kept], 1))
+        start = 0
+        for effect, kept in group:
+            tried = []
+            for shape, columns in kept:
+                part = z[:, start : start + columns.shape[1]]
+                start += columns.shape[1]
+                tried.append((shape, _evidence(problem, projector, effect, columns, part, block)))
+            found.append(_candidate(effect, tried))
+    return sorted(found, key=lambda c: -c.evidence)
+
+
+def _evidence(
+    problem: Problem, projector: Projector, effect: Effect, columns: Tensor, z: Tensor, block: Tensor
+) -> Evidence:
+    shape = (*problem.expected.shape, -1)
+    residual = projector.residual.view(problem.expected.shape)
+    return evidence(
+        columns.reshape(shape), z.reshape(shape), residual, block, prior_deviations(effect), positive(effect)
+    )
+
+
+def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:
+    """The best shape; the evidence is the mean of the Bayes factors of all that could have been."""
+    shape, best = max(tried, key=lambda entry: entry[1].nats)
+    number = len(effect.shape_grid())
+    nats = torch.tensor([e.nats for _, e in tried], dtype=torch.float64)
+    mean = float(torch.logsumexp(nats, 0)) - math.log(number)
+    effect.set_all(shape)
+    if bool(effect.precision().any()) and best.scale:
+        effect.prior_scale = best.scale
+    return Candidate(effect, mean, best.retained, best.scatter, shape, best.step, best.error)
+
+
+def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
+    """Terms whose columns are projected together.
+
+    A projection passes over all nuisance columns, however few it projects.
+    """
+    group, width = [], 0
+    for effect, kept in tried:
+        group.append((effect, kept))
+        width += sum(columns.shape[1] for _, columns in kept)
+        if width >= TOGETHER:
+            yield group
+            group, width = [], 0
+    if group:
+        yield group
+
+
+def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[tuple[Shape, Tensor]]:
+    """The ``KEPT`` most promising shapes with their columns.
+
+    Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what
+    costs. So shapes are ranked by the score over the unprojected information.
+    """
+    shapes, ranked = effect.shape_grid(), []
+    for shape in shapes:
+        effect.set_all(shape)
+        z = weighted_columns(problem, effect)
+        worth = 0.0
+        if len(shapes) > 1:
+            score, information = (z.T @ projector.residual).double(), (z.T @ z).double()
+            floor = 1e-9 * information.diagonal().mean() + 1e-30
+            worth = float(score @ torch.linalg.solve(information + floor * torch.eye(len(score)), score))
+        ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
+    ranked.sort(key=lambda entry: -entry[0])
+    kept = []
+    for _, shape, known in ranked[:KEPT]:
+        effect.set_all(shape)
+        kept.append((shape, weighted_columns(problem, effect) if known is None else known))
+    return kept
+
+
+def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:
+    """One random coefficient a spot: do the spots' own scores scatter more than counts alone let them?"""
+    shapes, best = effect.shape_grid(), None
+    nats = []
+    for shape in shapes:
+        effect.set_all(shape)
+        column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
+        score = (column * projector.residual.view_as(column)).sum(1).double()
+        information = (column**2).sum(1).double().clamp_min(1e-30)
+        gain, width, share = best_width(score, information, sparse(effect))
+        nats.append(gain)
+        if best is None or gain > best[0]:
+            best = gain, width, share, shape, score, information
+    assert best is not None
+    _, effect.width, effect.share, shape, score, information = best
+    effect.set_all(shape)
+    full = torch.zeros(len(problem.model.laser))
+    full[problem.spots] = coefficients(score, information, effect.width, sparse(effect)).float()
+    error = torch.full_like(full, float("nan"))
+    error[problem.spots] = information.rsqrt().float()
+    mean = float(torch.logsumexp(torch.tensor(nats, dtype=torch.float64), 0)) - math.log(len(shapes))
+    return Candidate(effect, mean, 1.0, 1.0, shape, full, error)
