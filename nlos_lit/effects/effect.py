@@ -122,8 +122,15 @@ class Effect(nn.Module, Hooks):
             step = step[p.size :]
 
     def factors(self, spots: Tensor) -> Tensor | None:
-        """``[B, k]`` where the k amplitudes only delay each spot, by Σ_k factor · value; None elsewhere."""
+        """``[B, J]`` where amplitudes act as those of :meth:`alone` do, times a number at each spot.
+
+        Then there are J times as many as those; None where that is not so.
+        """
         return None
+
+    def alone(self) -> Effect:
+        """An effect that acts alike at all spots; see :meth:`factors`."""
+        raise NotImplementedError
 
     def precision(self) -> Tensor:
         """``[k]`` prior precision of all stored values, amplitudes first; 0 where there is no prior."""

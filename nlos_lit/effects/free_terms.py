@@ -18,6 +18,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.smooth import length, over_wall
+from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
@@ -205,6 +206,9 @@ class _FreeDelay(FreeTerm):
     def factors(self, spots: Tensor) -> Tensor:
         return self.functions[spots]
 
+    def alone(self) -> Effect:
+        return TimingJitter(self.scan)
+
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + (self.functions[spots] @ self.value("field").reshape(-1))[:, None, None]
 
@@ -250,6 +254,12 @@ class _FreeResponse(FreeTerm):
     def size(cls, scan: Scan) -> int:
         return (1 + len(TAILS)) * cls.basis(scan).shape[1]
 
+    def factors(self, spots: Tensor) -> Tensor | None:
+        return self.functions[spots]
+
+    def alone(self) -> Effect:
+        return _EqualResponse(self.scan)
+
     def _weights(self) -> Tensor:
         """``[K_spot, 4]`` coefficients."""
         return self.value("field").reshape(self.functions.shape[1], -1)
@@ -262,6 +272,19 @@ class _FreeResponse(FreeTerm):
         weights = self.functions[spots] @ self._weights()
         changed = torch.einsum("ktu,bu->bkt", self.kernels, signal)
         return (signal + torch.einsum("bk,bkt->bt", weights, changed)).clamp_min(0)
+
+
+class _EqualResponse(_FreeResponse):
+    """The response changes everywhere alike."""
+
+    name, axis = "equal_response", "time"
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return torch.ones(scan.n_spots, 1)
+
+    def factors(self, spots: Tensor) -> None:
+        return None
 
 
 class FreeResponseScan(_FreeResponse):

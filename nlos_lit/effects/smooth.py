@@ -70,9 +70,6 @@ class SmoothEffect(Effect):
         functions = self.functions if spots is None else self.functions[spots]
         return functions @ self.value(self.coefficients).reshape(-1)
 
-    def factors(self, spots: Tensor) -> Tensor | None:
-        return self.functions[spots] if self.hooks == {"time"} else None
-
     def quantities(self) -> dict[str, Quantity]:
         p, field = self.declared[self.coefficients], self.field()
         reported = {"rms": Quantity(length(field / len(field) ** 0.5, p.scale), p.unit, kind=p.kind)}

@@ -7,8 +7,10 @@ from typing import ClassVar
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
 
@@ -56,6 +58,12 @@ class TimeDrift(SmoothEffect):
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"rms": 1.5 * scan.bin_length}
+
+    def factors(self, spots: Tensor) -> Tensor:
+        return self.functions[spots]
+
+    def alone(self) -> Effect:
+        return TimingJitter(self.scan)
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         return length + self.field(spots)[:, None, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,7 +16,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.split import Split
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.runtime.memory import check_machine
-from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings, rounds_of
 from nlos_lit.surfels.fitted import fit_surfels
 
 COARSE = 3  # rounds of a parsimonious scene
@@ -75,6 +76,20 @@ class BasePipeline:
             settings = replace(settings, rounds=min(COARSE, settings.rounds), more=0)
         given = (capture, *image, settings, split.fit)
         return fit_surfels(*given, extension=extension, seed=seed).fit
+
+    def grow(self, fit: SurfelFit, seed: int) -> SurfelFit:
+        """A parsimonious fit gone on with, with surfels as many and as fine as the counts ask for.
+
+        Args:
+            fit: that is copied.
+            seed: of batches and tested spots.
+        """
+        again = fit.copy(copy.deepcopy(fit.extension), seed)
+        again.settings = self.surfels
+        left = max(1, self.surfels.rounds - COARSE)
+        again.schedule(rounds_of(self.surfels.steps, left, settle=False, grow_first=True), self.surfels.more)
+        again.finish()
+        return again
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
         """Image and parsimonious fit without effects."""

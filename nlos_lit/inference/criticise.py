@@ -32,6 +32,7 @@ from nlos_lit.surfels.fit import SurfelFit
 
 log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int, bool], SurfelFit]
+Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 120  # batches, and as many again at falling rate
 HOPELESS = 0.05  # of the best evidence: a rebuild does not turn such odds
@@ -57,7 +58,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 0.01
     errors: float = 2.0
-    rivals: int = 5
+    rivals: int = 4
     finalists: int = 2
     open_share: float = 0.05
     most: int = 5
@@ -216,6 +217,7 @@ class Loop:
     Args:
         rebuild: a fit from new seeds with given effects, begun at their present values, random seed, and
             whether surfels may be divided as finely as the counts ask for.
+        grow: the same scene gone on with until surfels are as many and as fine as the counts ask for.
         split: of the spots.
         scan: of the capture.
         settings: of the criticism.
@@ -224,9 +226,17 @@ class Loop:
     """
 
     def __init__(
-        self, rebuild: Rebuild, split: Split, scan: Scan, settings: CriticismSettings, seed: int, steps: Steps
+        self,
+        rebuild: Rebuild,
+        grow: Grow,
+        split: Split,
+        scan: Scan,
+        settings: CriticismSettings,
+        seed: int,
+        steps: Steps,
     ) -> None:
-        self.rebuild, self.split, self.scan, self.settings = rebuild, split, scan, settings
+        self.rebuild, self.grow = rebuild, grow
+        self.split, self.scan, self.settings = split, scan, settings
         self.seed, self.steps, self.number = seed, steps, 0
         self.block = split.block[split.select]
 
@@ -254,7 +264,7 @@ class Loop:
         for c in rivals:
             jobs.append((f"going on with {c.name}", c, partial(self._warm, fit, [c])))
         warm, *tried = self._trials(fit, jobs)
-        last = finalists(tried, s.finalists)
+        last = [] if grown else finalists(tried, s.finalists)
         self.steps.plan(fit=len(last) + 1)
         tried += self._trials(
             fit,
@@ -262,21 +272,23 @@ class Loop:
                 (
                     f"rebuilding the scene with {t.name}",
                     t.candidate,
-                    partial(_rebuilt, self.rebuild, t.fit.extension, self.seed, grown),
+                    partial(_rebuilt, self.rebuild, t.fit.extension, self.seed, False),
                 )
                 for t in last
             ],
         )
         asked = best_of_each(tried)
-        best = choose(asked, self.block, s.errors) if asked else None
-        won = best is not None and self._beats(best, warm) and best.gain.nats > s.errors * best.gain.error
-        if grown and not won:
+        sure = [t for t in asked if self._beats(t, warm) and t.gain.nats > s.errors * t.gain.error]
+        best = choose(sure, self.block, s.errors) if sure else None
+        if grown and best is None:
             return Turn(candidates, asked, grown=grown)
-        text = "rebuilding the scene by other seeds" if grown else "rebuilding the scene finer"
-        finer = partial(_rebuilt, self.rebuild, fit.extension, self.seed + 1, True)
-        controls = self._trials(fit, [(text, None, finer)])
+        other = partial(_rebuilt, self.rebuild, fit.extension, self.seed + 1, True)
+        more: Job = ("rebuilding the scene by other seeds", None, other)
+        if not grown:
+            more = ("refining the scene", None, partial(self.grow, fit, self.seed + 1))
+        controls = self._trials(fit, [more])
         trials = weighed([*asked, *controls], self.block)
-        if best is not None and won and all(self._beats(best, control) for control in controls):
+        if best is not None and all(self._beats(best, control) for control in controls):
             best = next(t for t in trials if t.candidate is best.candidate)
             group = [t.name for t in trials if t.candidate and t is not best and t.weight > s.open_share]
             return Turn(candidates, trials, best, group, grown)
@@ -286,10 +298,18 @@ class Loop:
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""
-        again = fit.copy(begun_with(fit, extra), self.seed)
-        solve_spots(again)
-        again.run(1, steps=WARM, settle=False)
-        return solve_spots(again)
+        return self._go_on(fit.copy(begun_with(fit, extra), self.seed))
+
+    def _without(self, fit: SurfelFit, name: str) -> SurfelFit:
+        """The same scene, gone on without a term."""
+        fewer = [e for e in copy_effects(fit.extension, []).effects if e.name != name]
+        return self._go_on(fit.copy(Extension(fewer), self.seed))
+
+    @staticmethod
+    def _go_on(fit: SurfelFit) -> SurfelFit:
+        solve_spots(fit)
+        fit.run(1, steps=WARM, settle=False)
+        return solve_spots(fit)
 
     def _beats(self, trial: Trial, control: Trial) -> bool:
         """It predicts better than more scene does, by more than the difference's error."""
@@ -307,12 +327,11 @@ class Loop:
                 trials.append(Trial(c, again, value, compare(before, value, self.block)))
         return trials
 
-    def drop_needless(self, fit: SurfelFit, fine: bool) -> tuple[SurfelFit, dict[str, Comparison]]:
-        """Backward: without which terms does a rebuilt scene predict as well?
+    def drop_needless(self, fit: SurfelFit) -> tuple[SurfelFit, dict[str, Comparison]]:
+        """Backward: without which terms does the scene, gone on with, predict as well?
 
         Args:
             fit: with all accepted terms.
-            fine: how it was rebuilt.
 
         Returns:
             the fit without needless terms, and what each other one's absence costs.
@@ -324,18 +343,16 @@ class Loop:
                 return fit, {}
             jobs = []
             for name in names:
-                fewer = Extension([e for e in copy_effects(fit.extension, []).effects if e.name != name])
                 key = f"without_{name}_of_{len(names)}"
-                job = partial(_rebuilt, self.rebuild, fewer, self.seed, fine)
-                jobs.append((f"rebuilding the scene without {name}", key, job))
+                jobs.append((f"going on without {name}", key, partial(self._without, fit, name)))
             self.steps.plan(fit=len(jobs))
             rebuilt = self.steps.several("fit", jobs, self.settings.processes)
             value = log_likelihood(fit, self.split.select)
-            losses, fits = {}, {}
-            for name, fewer_fit in zip(names, rebuilt, strict=True):
-                if fewer_fit is not None:
-                    losses[name] = compare(log_likelihood(fewer_fit, self.split.select), value, self.block)
-                    fits[name] = fewer_fit
+            fits = dict(zip(names, rebuilt, strict=True))
+            losses = {
+                name: compare(log_likelihood(fewer, self.split.select), value, self.block)
+                for name, fewer in fits.items()
+            }
             needless = [n for n, loss in losses.items() if loss.nats < self.settings.errors * loss.error]
             if not needless:
                 return fit, losses
@@ -422,6 +439,7 @@ def choose(trials: list[Trial], block: np.ndarray, errors: float) -> Trial:
 def criticise(
     base: SurfelFit,
     rebuild: Rebuild,
+    grow: Grow,
     split: Split,
     scan: Scan,
     s: CriticismSettings,
@@ -432,7 +450,7 @@ def criticise(
 
     Args:
         base: fitted to ``split.fit`` without effects, coarse.
-        rebuild: see :class:`Loop`.
+        rebuild, grow: see :class:`Loop`.
         split: of the spots.
         scan: of the capture.
         s: settings.
@@ -442,7 +460,7 @@ def criticise(
     Returns:
         base, turns and final fit.
     """
-    loop = Loop(rebuild, split, scan, s, seed, steps or Steps())
+    loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
     fit, again, turns, grown = base, None, [], False
     while len(fit.extension.effects) < s.most:
         turns.append(loop.turn(fit, grown))
@@ -455,5 +473,5 @@ def criticise(
                 base = fit
         else:
             again, fit = None, taken.fit
-    fit, losses = loop.drop_needless(fit, grown)
+    fit, losses = loop.drop_needless(fit)
     return Findings(base, fit, turns, losses, again)

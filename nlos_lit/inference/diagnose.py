@@ -84,7 +84,7 @@ def diagnose(
         again.counts = base.counts
         return again
 
-    found = criticise(base, rebuild, split, scan, options, seed, steps)
+    found = criticise(base, rebuild, pipeline.grow, split, scan, options, seed, steps)
     null = None
     if options.toys:
         assert folder is not None, "toys are kept in a folder"

@@ -27,7 +27,6 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.functional.smooth_basis import smooth_map_basis
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
@@ -146,11 +145,12 @@ def effect_columns(
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
     factors = effect.factors(spots)
-    if factors is not None:  # the same derivative at every spot, by what each coefficient adds there
-        delay = TimingJitter(effect.scan)
-        alone = effect_columns(model, whole, spots, delay, transients=transients)
-        unit = effect.amplitudes[0].scale / delay.amplitudes[0].scale
-        return (alone.view(len(spots), -1, 1) * (unit * factors)[:, None]).flatten(0, 1)
+    if factors is not None:
+        one = effect.alone()
+        alike = effect_columns(model, whole, spots, one, transients=transients)
+        unit = effect.amplitudes[0].scale / one.amplitudes[0].scale
+        by_spot = alike.view(len(spots), -1, 1, alike.shape[1])
+        return (by_spot * (unit * factors)[:, None, :, None]).flatten(2).flatten(0, 1)
     index = list(whole.effects).index(effect)
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
     names = [
@@ -192,7 +192,8 @@ def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> 
 
 def acting_order(effect: Effect) -> int:
     """Sort key: the registry's order, which is that of the light's way, and free terms after it."""
-    return [*EFFECTS, *FREE].index(type(effect))
+    order = [*EFFECTS, *FREE]
+    return order.index(type(effect)) if type(effect) in order else len(order)
 
 
 class _Forward(nn.Module):
