@@ -1,128 +1,235 @@
-"""The blind benchmark: hide effects in captures, diagnose the files, count what was found: ``python
-benchmarks/blind.py table``.
+"""The blind benchmark: hide effects in captures, diagnose the files, count what was found.
 
-    python benchmarks/blind.py cases                the small seeded set that tests use a part of
-    python benchmarks/blind.py table                nulls, single effects, pairs, unknowns; some 2 hours of 2
-    cores python benchmarks/blind.py report               docs/blind.md from what has been run so far
+    python benchmarks/blind.py run set=development first=0 number=40    diagnoses, stored as they are done
+    python benchmarks/blind.py rows set=validation                   its rows into docs/blind_rows.jsonl
+    python benchmarks/blind.py report                                   docs/blind.md from those rows
 
-Every diagnosis is stored as it is done (benchmarks/results/blind/), so that an interrupted run goes on where
-it was.
+Development captures may be looked at as often as one likes, validation captures when a design is finished;
+the test set is drawn and run once, when the rules are frozen (docs/blind.md).
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
+import subprocess
 import sys
 import time
+from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind"), str(ROOT / "benchmarks")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind")]
 STORE = ROOT / "benchmarks" / "results" / "blind"
+ROWS = ROOT / "docs" / "blind_rows.jsonl"
 MARK = "<!-- measured: python benchmarks/blind.py report -->"
-SCENES = ("default", "letters", "z_confocal", "sphere_before_plate")
-RENDERS = ("z_confocal", "bunny_confocal")
-# counts a spot up to which a render's Monte-Carlo noise (5 % a bin and more) stays below that of the counts
-CALM = 1500
+CLEAR = 100.0  # projected true statistic from which on a hidden effect ought to be named
 
 
-def table() -> dict[str, object]:
-    """The captures by name, in such an order that a part of the run is a fair sample of the whole.
-
-    42 without effects, every effect of the registry twice (at strengths 0 and 2, or 1 and 3), 12 pairs, every
-    unknown thrice; scenes and photon levels in turn.
-    """
-    from blind_inject import EFFECTS, UNKNOWN
-    from blind_truth import LEVELS, STRENGTHS, draw_spec
-
-    table_of = EFFECTS | UNKNOWN
-    steps = range(len(STRENGTHS))
-    kinds = {
-        "null": [((), ())] * 42,
-        "single": [((name,), ((k + 2 * again) % 4,)) for again in (0, 1) for k, name in enumerate(EFFECTS)],
-        "pair": [(None, tuple(steps[1:]))] * 12,
-        "unknown": [((name,), (strength,)) for strength in (2, 3, 1) for name in UNKNOWN],
-    }
-    drawn = []
-    for kind, wanted in kinds.items():
-        for k, (names, strengths) in enumerate(wanted):
-            seed = 1000 * (1 + list(kinds).index(kind)) + k
-            possible = table_of[names[0]].scenes if names else ()
-            fitting = [scene for scene in SCENES if scene in (possible or SCENES)] or possible
-            scenes = (fitting[k % len(fitting)],)
-            level = LEVELS[(k + k // len(LEVELS)) % len(LEVELS)]
-            if any(scene in RENDERS for scene in scenes):
-                level = min(level, CALM)
-            spec = draw_spec(
-                seed,
-                kind,
-                effects=names or None,
-                scenes=scenes,
-                strengths=strengths or tuple(steps),
-                levels=(level,),
-            )
-            drawn.append(((k + 0.5) / len(wanted), f"{kind}_{k:02d}", spec))
-    return {name: spec for _, name, spec in sorted(drawn, key=lambda entry: entry[0])}
-
-
-def work(name: str, spec: object) -> str:
+def work(set_name: str, index: int) -> dict:
     """Diagnose one capture and store the outcome."""
-    from blind_judge import one_thread, run_case
+    import torch
+    from wild_judge import judge
 
     from nlos_lit.inference.criticise import CriticismSettings
 
-    one_thread()
-    outcome = run_case(spec, CriticismSettings(numerics=False, processes=1))
-    part = STORE / f".{name}.json"
-    part.write_text(json.dumps(outcome.to_dict()))
-    part.rename(STORE / f"{name}.json")
-    hidden = ", ".join((*outcome.hidden, outcome.unknown)).strip(", ") or "nothing"
-    strengths = "".join(map(str, outcome.spec["strengths"]))
-    said = ", ".join(outcome.named) or "-"
-    errors = {n: [round(v, 2) for v in e] for es in outcome.errors.values() for n, e in es.items()}
+    torch.set_num_threads(1)
+    outcome = asdict(judge(set_name, index, CriticismSettings(processes=1))) | {"commit": commit()}
+    file = STORE / f"{set_name}_{index:03d}.json"
+    part = file.with_suffix(".part")
+    part.write_text(json.dumps(outcome))
+    part.rename(file)
+    return outcome
+
+
+def commit() -> str:
+    """Of the checkout, marked where files differ from it."""
+    run = ["git", "-C", str(ROOT), "describe", "--always", "--dirty", "--abbrev=7"]
+    return subprocess.run(run, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def line(row: dict) -> str:
+    """One outcome in words."""
+    said = " + ".join("/".join(group) for group in row["named"]) or "-"
+    hidden = ", ".join(f"{n} {s}" for n, s in row["statistics"].items()) or "nothing"
     return (
-        f"{name} {spec.scene} {spec.level:g} | {hidden} {strengths} (TS {outcome.statistic:.0f}) "
-        f"-> {said} {outcome.groups} unexplained {outcome.unexplained or '-'} "
-        f"gain {outcome.gain:.0f}/{outcome.oracle:.0f} {errors} base {outcome.ratio:.3f} "
-        f"{outcome.seconds:.0f} s"
+        f"{row['set_name']} {row['index']} {row['spec']['family']} {row['spec']['scan']} "
+        f"{row['spec']['level']:g} | {hidden} {row['axes'] or ''} -> {said} unknown {row['unknown'] or '-'} "
+        f"| {row['base']:.3f} {row['extended']:.3f} {row['noise']:.3f} {row['seconds']:.0f} s {row['error']}"
     )
 
 
-def done(name: str, spec: object) -> bool:
-    """Whether the outcome of this very capture is stored."""
-    file = STORE / f"{name}.json"
-    return file.exists() and json.loads(file.read_text())["spec"] == json.loads(json.dumps(asdict(spec)))
-
-
-def run(specs: dict[str, object], processes: int = 2) -> None:
+def run(set_name: str, first: int, number: int, processes: int) -> None:
+    """Diagnose captures that have not been, several at a time."""
     STORE.mkdir(parents=True, exist_ok=True)
-    todo = {name: spec for name, spec in specs.items() if not done(name, spec)}
+    wanted = range(first, first + number)
+    todo = [k for k in wanted if not (STORE / f"{set_name}_{k:03d}.json").exists()]
     began = time.monotonic()
     with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        jobs = [pool.submit(work, name, spec) for name, spec in todo.items()]
+        jobs = [pool.submit(work, set_name, k) for k in todo]
         for count, job in enumerate(as_completed(jobs), 1):
             left = (time.monotonic() - began) / count * (len(jobs) - count)
-            print(f"[{count}/{len(jobs)}, {left / 60:.0f} min left] {job.result()}", flush=True)
+            print(f"[{count}/{len(jobs)}, {left / 60:.0f} min left] {line(job.result())}", flush=True)
+
+
+def keep_rows(set_name: str) -> None:
+    """Replace the rows of a set in the committed file by those that are stored."""
+    old = [json.loads(text) for text in ROWS.read_text().splitlines()] if ROWS.exists() else []
+    new = [json.loads(f.read_text()) for f in sorted(STORE.glob(f"{set_name}_*.json"))]
+    kept = [row for row in old if row["set_name"] != set_name] + new
+    ROWS.write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
+def interval(right: int, of: int) -> str:
+    """Rate and its 95 % Clopper–Pearson interval."""
+    from scipy.stats import beta
+
+    if of == 0:
+        return "–"
+    low = beta.ppf(0.025, right, of - right + 1) if right else 0.0
+    high = beta.ppf(0.975, right + 1, of - right) if right < of else 1.0
+    return f"{right} of {of} = {right / of:.0%} ({low:.0%} … {high:.0%})"
+
+
+def first_right(row: dict) -> bool:
+    """The first name said, alone or in a group of two, is right."""
+    (hidden,) = row["right"]
+    group = row["named"][0] if row["named"] else {}
+    return 0 < len(group) <= 2 and bool(set(group) & set(row["right"][hidden]))
+
+
+def wrong_names(row: dict) -> list[str]:
+    """Groups that hold nothing hidden, nor a look-alike of it."""
+    true = {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
+    return ["/".join(group) for group in row["named"] if not set(group) & true]
+
+
+def all_right(row: dict) -> bool:
+    """Everything hidden stands in some group."""
+    said = {name for group in row["named"] for name in group}
+    return all(said & set(right) for right in row["right"].values())
+
+
+def clear(row: dict) -> bool:
+    """Whether every hidden thing ought to show."""
+    return all(projected > CLEAR for _, projected in row["statistics"].values())
+
+
+def right_axis(row: dict) -> bool:
+    """An unknown: nothing named, and a free term along one of its axes."""
+    return not row["named"] and bool(set(row["unknown"]) & set(row["axes"]))
+
+
+def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
+    """What was asked for, and measured."""
+    by = defaultdict(list)
+    for case in cases:
+        by[case["kind"]].append(case)
+    seen = [c for c in by["single"] if clear(c)]
+    faint = [c for c in by["single"] if not clear(c)]
+    pairs = [c for c in by["pair"] if clear(c)]
+    hidden = by["single"] + by["pair"]
+    return [
+        (
+            "false names on effect-free captures",
+            "≤ 1 %",
+            interval(sum(bool(c["named"]) for c in by["null"]), len(by["null"])),
+        ),
+        (
+            "… a free term there",
+            "",
+            interval(sum(bool(c["unknown"]) for c in by["null"]), len(by["null"])),
+        ),
+        (
+            f"named first, alone or in a group of two (projected true statistic > {CLEAR:g})",
+            "≥ 95 %",
+            interval(sum(map(first_right, seen)), len(seen)),
+        ),
+        ("… of the fainter ones", "", interval(sum(map(first_right, faint)), len(faint))),
+        (
+            "a wrong name beside or instead of one or two hidden effects",
+            "",
+            interval(sum(bool(wrong_names(c)) for c in hidden), len(hidden)),
+        ),
+        (
+            "pairs: both named (both statistics clear)",
+            "≥ 90 %",
+            interval(sum(map(all_right, pairs)), len(pairs)),
+        ),
+        (
+            "unknown: nothing named",
+            "≥ 95 %",
+            interval(sum(not c["named"] for c in by["unknown"]), len(by["unknown"])),
+        ),
+        (
+            "unknown: nothing named, and a free term along the right axis",
+            "≥ 90 %",
+            interval(sum(map(right_axis, by["unknown"])), len(by["unknown"])),
+        ),
+        ("diagnoses that failed", "0", interval(sum(bool(c["error"]) for c in cases), len(cases))),
+    ]
+
+
+def table(cases: list[dict]) -> str:
+    """All rows of a set as Markdown."""
+    out = ["| what | asked for | measured (95 % interval) |", "|---|---|---|"]
+    out += [f"| {what} | {asked} | {value} |" for what, asked, value in rows_of(cases)]
+    seconds = sum(c["seconds"] for c in cases)
+    commits = ", ".join(sorted({c["commit"] for c in cases}))
+    out += ["", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each; commit {commits}.", ""]
+    heads = (
+        "no.",
+        "scene",
+        "scan",
+        "counts",
+        "hidden (projected statistic)",
+        "said",
+        "free terms",
+        "base / noise",
+        "after / noise",
+        "s",
+    )
+    out += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for c in cases:
+        hidden = ", ".join(f"{n} ({s[1]:.0f})" for n, s in c["statistics"].items()) or "nothing"
+        said = ", ".join("/".join(group) for group in c["named"]) or ("failed" if c["error"] else "–")
+        noise = c["noise"] or float("nan")
+        cells = (
+            c["index"], c["spec"]["family"], c["spec"]["scan"], f"{c['spec']['level']:g}", hidden, said,
+            ", ".join(c["unknown"]) or "–", f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}",
+            f"{c['seconds']:.0f}",
+        )  # fmt: skip
+        out.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(out)
+
+
+def report() -> None:
+    """Rewrite the tables of docs/blind.md."""
+    cases = [json.loads(text) for text in ROWS.read_text().splitlines()]
+    parts = []
+    for name in ("test", "validation", "development"):
+        rows = sorted((c for c in cases if c["set_name"] == name), key=lambda c: c["index"])
+        if rows:
+            parts.append(f"## The {name} set\n\n{table(rows)}\n")
+    page = ROOT / "docs" / "blind.md"
+    head = page.read_text().split(MARK)[0]
+    page.write_text(head + MARK + "\n\n" + "\n".join(parts))
 
 
 def main(arguments: list[str]) -> None:
-    what = arguments[0] if arguments else "table"
+    what = arguments[0] if arguments else ""
     given = dict(a.split("=", 1) for a in arguments[1:])
-    if what == "cases":
-        from blind_truth import CASES
-
-        run({f"case_{name.replace(' ', '_').replace(',', '')}": spec for name, spec in CASES.items()})
-    elif what == "table":
-        run(table(), int(given.get("processes", 2)))
+    if what == "run":
+        first, number, processes = (
+            int(given.get(n, d)) for n, d in (("first", 0), ("number", 40), ("processes", 2))
+        )
+        run(given.get("set", "development"), first, number, processes)
+    elif what == "rows":
+        keep_rows(given["set"])
     elif what == "report":
-        from blind_report import tables
-
-        page = ROOT / "docs" / "blind.md"
-        head = page.read_text().split(MARK)[0]
-        page.write_text(head + MARK + "\n\n" + tables(STORE))
+        report()
     else:
         raise SystemExit(__doc__)
 

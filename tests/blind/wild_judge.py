@@ -1,0 +1,107 @@
+"""A diagnosis of a capture of the evaluation sets, and what it said beside the truth.
+
+The code under test gets the capture file and nothing else.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import traceback
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from wild_statistic import true_statistics
+from wild_truth import make
+
+from data_modules.readers import read_capture
+from nlos_lit.capture import Capture
+from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.result import Diagnosis
+from nlos_lit.model.build import PipelineSettings
+from nlos_lit.surfels.fit import SurfelSettings
+
+SURFELS = SurfelSettings(most=2400)  # conf/surfels/diagnosis.yaml
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One row of the table; a diagnosis that fails is a row, too.
+
+    Args:
+        right: registry names that are right, of each thing hidden. alike: those right in a group with one.
+        axes: on which an unknown shows. statistics: ``[plain, projected]`` of each thing hidden.
+        named: weights by name of each effect that was accepted, in order. unknown: axes of free terms.
+        parameters: value and standard error by effect and quantity.
+        base, extended, noise: deviance per bin of the untouched spots.
+        largest: term and nats of the most evidence in the first pool. error: what went wrong.
+    """
+
+    set_name: str
+    index: int
+    spec: dict
+    kind: str
+    right: dict[str, list[str]]
+    alike: dict[str, list[str]]
+    axes: list[str]
+    statistics: dict[str, list[float]]
+    named: list[dict[str, float]] = field(default_factory=list)
+    unknown: list[str] = field(default_factory=list)
+    parameters: dict[str, dict[str, list[float]]] = field(default_factory=dict)
+    base: float = 0.0
+    extended: float = 0.0
+    noise: float = 0.0
+    largest: tuple[str, float] = ("", 0.0)
+    seconds: float = 0.0
+    error: str = ""
+
+
+def pipeline_for(capture: Capture) -> BasePipeline:
+    """Settings that follow from the capture's time window alone."""
+    near, far = (length / 2 for length in capture.path_gate)
+    model = PipelineSettings(0.1, wavelength_range=(2 / 3, 2.0))
+    return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, model, SURFELS, 2 << 30)
+
+
+def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
+    """Hide, diagnose, note what was said."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.hdf5"
+        truth = make(set_name, index, path)
+        capture = read_capture(path, "auto")
+    known = {
+        "set_name": set_name,
+        "index": index,
+        "spec": asdict(truth.spec),
+        "kind": truth.spec.kind,
+        "right": {name: list(said) for name, said in truth.right.items()},
+        "alike": {name: list(said) for name, said in truth.alike.items()},
+        "axes": list(truth.axes),
+        "statistics": {
+            n: [round(s.plain, 1), round(s.projected, 1)] for n, s in true_statistics(truth).items()
+        },
+    }
+    began = time.process_time()
+    try:
+        found, _ = diagnose(capture, pipeline_for(capture), options, name=path.stem, seed=0)
+    except Exception:  # a failure counts against the rates, and the others go on
+        return Outcome(**known, error=traceback.format_exc(limit=-2), seconds=time.process_time() - began)
+    return Outcome(**known, **said(found), seconds=time.process_time() - began)
+
+
+def said(found: Diagnosis) -> dict:
+    """The fields of an outcome that a diagnosis fills."""
+    test = found.untouched_test
+    return {
+        "named": [{n: round(w, 3) for n, w in (e.weights or {e.name: 1.0}).items()} for e in found.effects],
+        "unknown": [e.axis for e in found.unknown],
+        "parameters": {
+            e.name: {n: [p.value, p.stderr] for n, p in e.parameters.items()} for e in found.effects
+        },
+        "base": test["base"].deviance_per_bin,
+        "extended": test["extended"].deviance_per_bin,
+        "noise": test["extended"].deviance_noise,
+        "largest": (found.screened[0].name, found.screened[0].evidence),
+    }
