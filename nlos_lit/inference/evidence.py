@@ -9,17 +9,16 @@ Bayes factor against none
 
 λ_i the eigenvalues of the information ``C^½ Z⊥ᵀZ⊥ C^½``, w_i the squares of the scores in its eigenbasis. τ
 is where it is largest (type-II likelihood; M. Tipping, *JMLR* 1, 2001). Scanned shapes are equally likely
-beforehand, so that the mean of their Bayes factors counts. A single coefficient that cannot be negative is
-half normal.
+beforehand, so that the mean of their Bayes factors counts. Coefficients stay within their bounds: one that
+cannot be negative has no evidence where the counts want it to be.
 
 A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i between
-wall blocks, where it exceeds that of counts, divides w_i (the sandwich of P. Huber, 1967, and of K.-Y. Liang
-and S. Zeger, *Biometrika* 73, 1986).
+wall blocks, where it exceeds that of counts, divides scores and information (the sandwich of P. Huber, 1967,
+and of K.-Y. Liang and S. Zeger, *Biometrika* 73, 1986).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -107,13 +106,23 @@ def prior_deviations(effect: Effect) -> Tensor:
     return torch.where(unit > 0, unit.clamp_min(1e-30).rsqrt(), torch.ones_like(unit))
 
 
-def positive(effect: Effect) -> bool:
-    """Its one coefficient cannot be negative."""
-    return len(effect.amplitudes) == 1 and effect.amplitudes[0].lower == effect.amplitudes[0].null
+def step_bounds(effect: Effect) -> tuple[Tensor, Tensor]:
+    """``[k]`` least and largest steps of the stored amplitudes from their nulls."""
+    lower, upper = [], []
+    for p in effect.amplitudes:
+        assert p.null is not None  # what makes an amplitude
+        lower.append(torch.full((p.size,), (p.lower - p.null) / p.scale))
+        upper.append(torch.full((p.size,), (p.upper - p.null) / p.scale))
+    return torch.cat(lower).double(), torch.cat(upper).double()
 
 
 def evidence(
-    raw: Tensor, z: Tensor, residual: Tensor, block: Tensor, deviation: Tensor, one_sided: bool = False
+    raw: Tensor,
+    z: Tensor,
+    residual: Tensor,
+    block: Tensor,
+    deviation: Tensor,
+    bounds: tuple[Tensor, Tensor] | None = None,
 ) -> Evidence:
     """The log Bayes factor of a term.
 
@@ -123,7 +132,7 @@ def evidence(
         residual: ``[S, T]``, projected.
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
-        one_sided: the one coefficient is half normal.
+        bounds: ``[k]`` least and largest coefficients.
 
     Returns:
         what the counts say of it.
@@ -137,36 +146,34 @@ def evidence(
     values, vectors = torch.linalg.eigh(f.sum(0))
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
     u = s.sum(0) @ vectors
-    w = u.square()
-    tried = torch.from_numpy(VARIANCES)[:, None]
+    low, high = (None, None) if bounds is None else (b / deviation for b in bounds)
 
-    def best(w: Tensor) -> tuple[float, float]:
-        grown = 1 + tried * values
-        each = 0.5 * (tried * w / grown - grown.log())
-        if one_sided:
-            towards = u.sign() * (tried * w / grown).sqrt()
-            each = each + math.log(2) + torch.special.log_ndtr(towards)
-        gains = each.sum(1)
-        k = int(gains.argmax())
-        return float(gains[k]), float(VARIANCES[k])
+    def best(scatter: Tensor) -> tuple[float, float, Tensor]:
+        """Nats, τ² and the coefficients ``[k]``, where the likelihood counts as its φ-th root."""
+        found = 0.0, 0.0, torch.zeros_like(u)
+        for variance in VARIANCES:
+            grown = 1 + variance * values / scatter
+            mean = vectors @ (variance * u / scatter / grown)
+            if low is not None:
+                mean = mean.clamp(low, high)
+            along = mean @ vectors
+            gain = (along * u - 0.5 * values * along**2) / scatter - 0.5 * along**2 / variance
+            nats = float((gain - 0.5 * grown.log()).sum())
+            if nats > found[0]:
+                found = nats, float(variance), mean
+        return found
 
-    _, variance = best(w)
-    mean = vectors @ (variance * u / (1 + variance * values))
+    mean = best(torch.ones_like(u))[2]
     left = (s - f @ mean) @ vectors
     scatter = (left.square().sum(0) / values).clamp_min(1.0)
-    nats, variance = best(w / scatter)
-    if nats <= 0:
-        nats, variance = 0.0, 0.0
-    mean = variance * (vectors @ (u / scatter / (1 + variance * values / scatter)))
-    error = (vectors.square() @ (scatter / values)).sqrt()
+    nats, variance, mean = best(scatter)
     whole = (raw.double().square().sum((0, 1)) * deviation**2).clamp_min(1e-30)
-    retained = float((f.sum(0).diagonal() / whole).mean())
-    share = w / values
+    share = u.square() / values
     return Evidence(
         nats=nats,
         scale=variance**0.5,
         step=(mean * deviation).float(),
-        error=(error * deviation).float(),
-        retained=retained,
+        error=((vectors.square() @ (scatter / values)).sqrt() * deviation).float(),
+        retained=float((f.sum(0).diagonal() / whole).mean()),
         scatter=float((scatter * share).sum() / share.sum().clamp_min(1e-30)),
     )

@@ -15,7 +15,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.evidence import Evidence, Projector, evidence, positive, prior_deviations
+from nlos_lit.inference.evidence import Evidence, Projector, evidence, prior_deviations, step_bounds
 from nlos_lit.inference.per_spot import best_width, coefficients, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
@@ -154,7 +154,12 @@ def _evidence(
     shape = (*problem.expected.shape, -1)
     residual = projector.residual.view(problem.expected.shape)
     return evidence(
-        columns.reshape(shape), z.reshape(shape), residual, block, prior_deviations(effect), positive(effect)
+        columns.reshape(shape),
+        z.reshape(shape),
+        residual,
+        block,
+        prior_deviations(effect),
+        step_bounds(effect),
     )
 
 
