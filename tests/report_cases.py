@@ -27,7 +27,7 @@ NAMES = (
 )
 FREE_NAMES = (
     *("free_scan_delay", "free_wall_delay", "free_scan_background", "free_wall_background", "free_time"),
-    *("free_wall", "free_lines", "free_scan", "free_rate", "free_time_scan", "free_time_wall"),
+    *("free_wall", "free_lines", "free_scan", "free_rate", "free_response_scan", "free_response_wall"),
     "free_spot_gain",
 )
 NAN = float("nan")
@@ -73,8 +73,8 @@ SHAPES = {
     "free_wall": Shape("wall", "1", WALL, _bump(8, 6), np.linspace(-0.6, 0.6, 7)),
     "free_wall_delay": Shape("wall", "m", WALL, 0.02 * _bump(8, 8), WALL),
     "free_wall_background": Shape("wall", "1", WALL, _bump(8, 8), WALL),
-    "free_time_scan": Shape("time×scan", "1", GATE, _bump(16, 64), np.linspace(0, 4096, 65)),
-    "free_time_wall": Shape("time×wall", "1", GATE, _bump(16, 8), WALL),
+    "free_response_scan": Shape("time×scan", "1", GATE, _bump(16, 64), np.linspace(0, 4096, 65)),
+    "free_response_wall": Shape("time×wall", "1", GATE, _bump(16, 8), WALL),
 }
 UNKNOWN = {name: free(name, shape.axis, shape) for name, shape in SHAPES.items()}
 WITNESS = {

@@ -338,7 +338,14 @@ class FreeSpotGain(Free):
 
 
 def bands(place: Tensor, number: int) -> Tensor:
-    """``[n, number]`` one where a place in [0, 1] lies in the band, else zero.
+    """Indicators of equal bands.
+
+    Args:
+        place: ``[n]`` from 0 to 1.
+        number: of bands.
+
+    Returns:
+        ``[n, number]`` one where a place lies in the band, else zero.
 
     Examples:
         >>> bands(torch.tensor([0.0, 0.6, 1.0]), 2)
@@ -364,11 +371,19 @@ def response_changes(n_bins: int) -> Tensor:
     for tail in TAILS:
         decay = torch.exp(-late.clamp_min(0) / tail) * (late >= 0)
         changes.append(decay * (1 - torch.exp(torch.tensor(-1 / tail))) - (late == 0).float())
-    return torch.stack(changes)
+    return torch.stack(changes).to(torch.get_default_dtype())
 
 
 def time_bands(scan: Scan, number: int) -> Tensor:
-    """``[T, number]`` bands of equal width over the gate; nothing before it."""
+    """Indicators of equal bands of the gate.
+
+    Args:
+        scan: of the capture.
+        number: of bands.
+
+    Returns:
+        ``[T, number]``, nothing before the gate.
+    """
     first, last = scan.gate
     place = (torch.arange(scan.n_bins) - first) / (last - first)
     return bands(place, number) * (place >= 0)[:, None]

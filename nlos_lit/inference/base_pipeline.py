@@ -83,6 +83,9 @@ class BasePipeline:
         Args:
             fit: that is copied.
             seed: of batches and tested spots.
+
+        Returns:
+            the finer fit.
         """
         again = fit.copy(copy.deepcopy(fit.extension), seed)
         again.settings = self.surfels

@@ -373,6 +373,9 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     Args:
         trials: of one turn.
         block: ``[S]`` wall block of each select spot.
+
+    Returns:
+        the same trials.
     """
     shares = weights([t.likelihood for t in trials], block)
     found = [replace(t, weight=w) for t, w in zip(trials, shares, strict=True)]

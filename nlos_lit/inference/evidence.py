@@ -145,28 +145,24 @@ def evidence(
     f = score.new_zeros(blocks, *information.shape[1:]).index_add_(0, block, information)
     values, vectors = torch.linalg.eigh(f.sum(0))
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
-    u = s.sum(0) @ vectors
-    low, high = (None, None) if bounds is None else (b / deviation for b in bounds)
+    u, tried = s.sum(0) @ vectors, torch.from_numpy(VARIANCES)[:, None]
 
-    def best(scatter: Tensor) -> tuple[float, float, Tensor]:
+    def best(scatter: Tensor, bounds: tuple[Tensor, Tensor] | None) -> tuple[float, float, Tensor]:
         """Nats, τ² and the coefficients ``[k]``, where the likelihood counts as its φ-th root."""
-        found = 0.0, 0.0, torch.zeros_like(u)
-        for variance in VARIANCES:
-            grown = 1 + variance * values / scatter
-            mean = vectors @ (variance * u / scatter / grown)
-            if low is not None:
-                mean = mean.clamp(low, high)
-            along = mean @ vectors
-            gain = (along * u - 0.5 * values * along**2) / scatter - 0.5 * along**2 / variance
-            nats = float((gain - 0.5 * grown.log()).sum())
-            if nats > found[0]:
-                found = nats, float(variance), mean
-        return found
+        grown = 1 + tried * values / scatter
+        mean = (tried * u / scatter / grown) @ vectors.T
+        if bounds is not None:
+            mean = mean.clamp(bounds[0] / deviation, bounds[1] / deviation)
+        along = mean @ vectors
+        gain = (along * u - 0.5 * values * along**2) / scatter - 0.5 * along**2 / tried
+        nats = (gain - 0.5 * grown.log()).sum(1)
+        k = int(nats.argmax())
+        return (float(nats[k]), float(tried[k]), mean[k]) if nats[k] > 0 else (0.0, 0.0, torch.zeros_like(u))
 
-    mean = best(torch.ones_like(u))[2]
+    mean = best(torch.ones_like(u), None)[2]
     left = (s - f @ mean) @ vectors
     scatter = (left.square().sum(0) / values).clamp_min(1.0)
-    nats, variance, mean = best(scatter)
+    nats, variance, mean = best(scatter, bounds)
     whole = (raw.double().square().sum((0, 1)) * deviation**2).clamp_min(1e-30)
     share = u.square() / values
     return Evidence(

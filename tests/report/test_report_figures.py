@@ -136,7 +136,7 @@ def test_a_free_term_over_two_axes_is_an_image_around_0():
     values = np.log([[1.1, 1.0, 1.0], [1.0, 1.0, 0.8]])
     edges, edges_y = np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 2.0, 3.0])
     wall = plots.free_shape("free_wall_background", Shape("wall", "1", edges, values, edges_y)).axes[0]
-    product = plots.free_shape("free_time_scan", Shape("time×scan", "1", edges, values, edges_y)).axes[0]
+    product = plots.free_shape("free_response_scan", Shape("time×scan", "1", edges, values, edges_y)).axes[0]
     for axes in (wall, product):
         mesh = axes.collections[0]
         assert mesh.norm.vmin == -mesh.norm.vmax
