@@ -15,8 +15,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.problem import Problem
-from nlos_lit.inference.screen import Candidate
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 from nlos_lit.surfels.growth import Seeds
@@ -106,7 +107,7 @@ def hide_some(model: SurfelModel) -> None:
 
 
 def effect_of(name: str, scan: Scan, **values: float | Tensor) -> Effect:
-    effect = next(e for e in EFFECTS if e.name == name)(scan)
+    effect = next(e for e in [*EFFECTS, *FREE] if e.name == name)(scan)
     for parameter, value in values.items():
         effect.set(parameter, value)
     return effect
@@ -168,20 +169,11 @@ def fit_of(
     return SurfelFit(*known, extension, generator, order)
 
 
-def candidate(
-    name: str,
-    p_value: float = 1e-9,
-    gain: float = 100.0,
-    retained: float = 0.5,
-    direction: Tensor | None = None,
-) -> Candidate:
-    """What a screening might have found, on a capture of twelve spots."""
+def candidate(name: str, evidence: float = 100.0) -> Candidate:
+    """What the pool might have found, on a capture of twelve spots."""
     effect = effect_of(name, Scan.of(capture_of(scattered(12))))
     size = sum(p.size for p in effect.amplitudes)
-    direction = torch.ones(4) / 2 if direction is None else direction
-    return Candidate(
-        effect, 2 * gain, p_value, retained, gain, torch.zeros(size), torch.ones(size), {}, direction
-    )
+    return Candidate(effect, evidence, 0.5, 1.0, {}, torch.zeros(size), torch.ones(size))
 
 
 def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:

@@ -1,7 +1,7 @@
 """A diagnosis of a hidden capture, and whether it was right.
 
-The code under test gets the capture file and nothing else. The oracle is told the true effect's name and goes
-through the same refits; its gain says what was there to be had.
+The code under test gets the capture file and nothing else. The oracle is told the true effects' names and
+rebuilds the scene with them; its gain says what was there to be had.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from blind_truth import Spec, Truth, make_capture
 from data_modules.readers import read_capture
 from nlos_lit.capture import Capture
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Findings, best_likelihood
+from nlos_lit.inference.criticise import CriticismSettings, Findings, begun_with, solve_spots
 from nlos_lit.inference.diagnose import diagnose
-from nlos_lit.inference.joint_step import copy_effects
-from nlos_lit.inference.refit import Comparison, compare, log_likelihood, refit_with
+from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import split_spots
 from nlos_lit.model.build import PipelineSettings
@@ -34,13 +33,13 @@ class Outcome:
     """What was hidden and what was said.
 
     Args:
-        named: accepted effects in order, first their groups. statistic: 2 × the oracle's gain over a control
-            on spots that neither fitted, scaled to the number of fitted spots; statistic_error: its standard
-            error, by bootstrap over wall blocks.
-        gain, oracle: nats on the select spots.
+        named: accepted effects in order, first their groups.
+        unexplained: the axis of the accepted free term with the most evidence, or "".
+        statistic: 2 × the oracle's gain on spots that no fit saw, scaled to the number of fitted spots;
+            statistic_error: its standard error, by bootstrap over wall blocks.
+        gain, oracle: nats on the select spots, over the base.
         errors: per true quantity, (found - true)/stderr and found/true - 1.
-        screened: the six best of the first screening: name, statistic, predicted gain (nats), retained
-            information.
+        screened: the six best of the first pool: name, evidence (nats), retained information.
     """
 
     spec: dict
@@ -57,7 +56,7 @@ class Outcome:
     errors: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     values: dict[str, dict[str, float]] = field(default_factory=dict)
     found: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
-    screened: list[tuple[str, float, float, float]] = field(default_factory=list)
+    screened: list[tuple[str, float, float]] = field(default_factory=list)
     ratio: float = 1.0
     seconds: float = 0.0
 
@@ -101,13 +100,12 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         truth = make_capture(spec, path)
         diagnosis, found, capture = diagnose_file(path, options)
     split = split_spots(capture)
-    gain, best, weight = 0.0, Comparison(0.0, 0.0, (0.0, 0.0)), len(split.fit) / len(split.select)
-    if diagnosis.effects or (oracle and truth.names):
-        controls = found.turns[0].controls or [found.base, refit_with(found.base, [], options.steps, 0)]
-        before = best_likelihood(controls, split)
-        gain = float((log_likelihood(found.final, split.select) - before).sum()) if diagnosis.effects else 0.0
-        if oracle and truth.names:
-            best = oracle_gain(truth, found, capture, options, before)
+    weight = len(split.fit) / len(split.select)
+    before = log_likelihood(found.base, split.select)
+    gain = float((log_likelihood(found.final, split.select) - before).sum())
+    best = Comparison(0.0, 0.0, (0.0, 0.0))
+    if oracle and truth.names:
+        best = oracle_gain(truth, found, capture, before)
     return Outcome(
         spec=asdict(spec),
         hidden=truth.names,
@@ -123,31 +121,19 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         errors=parameter_errors(truth, diagnosis),
         values=truth.values,
         found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
-        screened=[
-            (c.name, c.statistic, c.predicted_gain, c.retained_information) for c in diagnosis.screened[:6]
-        ],
+        screened=[(c.name, c.evidence, c.retained_information) for c in diagnosis.screened[:6]],
         ratio=diagnosis.base.deviance_per_bin / diagnosis.base.deviance_noise,
         seconds=diagnosis.seconds,
     )
 
 
-def oracle_gain(
-    truth: Truth, found: Findings, capture: Capture, options: CriticismSettings, before: torch.Tensor
-) -> Comparison:
-    """Nats on the select spots of the better of two fits that are told the true effects.
-
-    One starts from the fit that is there, one from new seeds.
-    """
-    split = split_spots(capture)
-    candidates = [c for c in found.turns[0].candidates if c.effect.name in truth.names]
-    warm = refit_with(found.base, candidates, options.steps, 0)
-    pipeline = pipeline_for(capture)
-    anew = pipeline.fit(capture, split, pipeline.image(capture), copy_effects(warm.extension, []), 0)
-    block = split.block[split.select]
-    return max(
-        (compare(before, log_likelihood(f, split.select), block) for f in (warm, anew)),
-        key=lambda gain: gain.nats,
-    )
+def oracle_gain(truth: Truth, found: Findings, capture: Capture, before: torch.Tensor) -> Comparison:
+    """Nats on the select spots of a scene that is rebuilt with the true effects, as fine as the final one."""
+    split, pipeline = split_spots(capture), pipeline_for(capture)
+    candidates = [c for c in found.turns[0].candidates if c.name in truth.names]
+    extension = begun_with(found.base, candidates)
+    anew = pipeline.fit(capture, split, pipeline.image(capture), extension, 0, fine=found.turns[-1].grown)
+    return compare(before, log_likelihood(solve_spots(anew), split.select), split.block[split.select])
 
 
 def parameter_errors(truth: Truth, diagnosis: Diagnosis) -> dict[str, dict[str, tuple[float, float]]]:

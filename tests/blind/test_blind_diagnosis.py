@@ -14,9 +14,9 @@ from blind_truth import CASES, Spec
 from nlos_lit.inference.criticise import CriticismSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-# Fewer spots, rivals and steps than a diagnosis takes; no rebuilds with what was not asked for.
-QUICK = CriticismSettings(numerics=False, spots=256, steps=30, rivals=2, finalists=1, far_off=9.0, most=1)
-WHOLE = CriticismSettings(numerics=False)
+# Fewer spots and rivals than a diagnosis takes.
+QUICK = CriticismSettings(spots=256, rivals=2, finalists=1, most=1)
+WHOLE = CriticismSettings()
 HARD = {
     "retroreflection": "without cosines the counts do not tell normals; the base breaks (docs/criticism.md)",
     "wall_tilt": "a tilted wall and a turned scene are the same to second order (docs/blind.md)",

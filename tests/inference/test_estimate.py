@@ -4,7 +4,8 @@ makes of them.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -15,13 +16,13 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.assemble import _screened, alternatives, judge, weighed
+from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
 from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
-from nlos_lit.inference.discrepancy import Discrepancy
-from nlos_lit.inference.form import Form
+from nlos_lit.inference.heldout import Comparison
+from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.problem import build_problem, weighted_columns
-from nlos_lit.inference.refit import Comparison
-from nlos_lit.inference.screen import Candidate
+from nlos_lit.inference.residuals import SIDE
+from nlos_lit.inference.split import split_spots
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty
 from nlos_lit.surfels.fit import SurfelFit
@@ -186,166 +187,169 @@ def test_errors_are_those_of_repeated_measurements():
     assert torch.all(steps.mean(0).abs() < 4 * error / 200**0.5)
 
 
-def findings(
-    gains: list[float], left: list[Discrepancy], had: list[Discrepancy] = (), predicted: float = 0.0
-) -> Findings:
-    """Effects accepted with ``gains`` nats on 64 select spots, what is left, and a small fit.
+def found_candidate(name: str, scan: Scan, evidence: float, step: Tensor | float = 0.0) -> Candidate:
+    effect = effect_of(name, scan)
+    size = sum(p.size for p in effect.amplitudes)
+    steps = torch.full((size,), step) if isinstance(step, float) else step
+    return Candidate(effect, evidence, 0.4, 1.5, {}, steps, torch.full((size,), 0.1))
 
-    ``had``: what the base left. ``predicted``: nats, by each effect's screening.
-    """
-    names = ["irf_tail", "pile_up"][: len(gains)]
-    effects = [effect_of(n, SCAN) for n in names]
-    final = SimpleNamespace(extension=Extension(effects), model=range(12), counts=torch.zeros(160, 58))
+
+@pytest.fixture(scope="module")
+def findings():
+    """A tail and a free map, accepted beside a rival each, and what the pool says before and after."""
+    scene = capture_of(raster(16), scan_shape=(16, 16))
+    scan, model = Scan.of(scene), surfels(scene, level=10.0)
+    tail, free = effect_of("irf_tail", scan, fraction=0.2), effect_of("free_wall", scan)
+    free.set("field", 0.05 * torch.ones(free.declared["field"].size))
+    extension = Extension([tail, free])
+    measured = drawn(model, extension, scene)
+    split = split_spots(measured)
+    base, final = (fit_of(model, measured, e, split.fit) for e in (Extension([]), extension))
+    nothing = torch.zeros(len(split.select))
+
+    def trial(name: str, evidence: float, gain: float, weight: float) -> Trial:
+        one = found_candidate(name, scan, evidence)
+        return Trial(one, final, nothing, Comparison(gain, 1.0, (gain - 2, gain + 2)), weight)
+
+    first = [
+        found_candidate(n, scan, e)
+        for n, e in (("irf_tail", 500.0), ("afterpulsing", 400.0), ("free_wall", 90.0), ("free_time", 4.0))
+    ]
+    won, second = trial("irf_tail", 500.0, 300.0, 0.6), trial("free_wall", 90.0, 60.0, 0.9)
+    rival, beside = trial("afterpulsing", 400.0, 290.0, 0.2), trial("free_wall", 90.0, 80.0, 0.1)
+    control = Trial(None, base, nothing, Comparison(1.0, 1.0, (-1, 3)), 0.1)
     turns = [
-        Turn(
-            [],
-            had,
-            [],
-            Trial(
-                Candidate(e, 0, 0, 0, predicted, None, None, {}, None), None, Comparison(g, 1, (0, 0)), None
-            ),
-            [],
-        )
-        for e, g in zip(effects, gains, strict=True)
+        Turn(first, [won, rival, beside, control], won, ["afterpulsing", "free_wall"]),
+        Turn(first[1:], [second], second, []),
+        Turn(first[3:], [], None, []),
     ]
-    return Findings(final, final, [*turns, Turn([], left, [], None, [])])
+    losses = {"irf_tail": Comparison(250.0, 5.0, (240, 260)), "free_wall": Comparison(60.0, 5.0, (50, 70))}
+    return Findings(base, final, turns, losses), measured, split, scan
 
 
-SPLIT = SimpleNamespace(fit=np.arange(160), select=np.arange(64))
+def diagnosed(findings, null: Null | None = None):
+    found, measured, split, scan = findings
+    return assemble(measured, found, split, scan, CriticismSettings(spots=48), null, "x", 9.0, 3)
 
 
-def discrepancy(axis: str, gain: float, p: float = 1e-9) -> Discrepancy:
-    return Discrepancy(axis, gain, 2 * gain, 40, p)
+@FORWARD_MODE
+def test_what_is_said_of_accepted_terms(findings):
+    said = diagnosed(findings)
+    (tail,), (free,) = said.effects, said.unknown
+    # Six and two tenths remain when the map, which was accepted beside, is no rival, nor is more scene.
+    assert tail.weights == pytest.approx({"irf_tail": 0.75, "afterpulsing": 0.25})
+    assert tail.confusable_with == ["afterpulsing"]
+    assert "background" in tail.split_by
+    assert said.groups == [["irf_tail", "afterpulsing"]]
+    assert (tail.evidence, tail.axis, tail.shape) == (500, "", None)
+    assert tail.parameters["fraction"].value == pytest.approx(0.2)
+    found, measured, split, _ = findings
+    photons, bins = measured.gated_counts()[split.select].sum(), len(split.select) * 58
+    gain = tail.heldout_gain
+    assert gain.nats_per_photon == pytest.approx(250 / photons)
+    assert gain.ci95 == pytest.approx((240 / photons, 260 / photons))
+    assert gain.deviance_per_bin_after == pytest.approx(said.extended.deviance_per_bin)
+    assert gain.deviance_per_bin_before - gain.deviance_per_bin_after == pytest.approx(500 / bins)
+    assert (free.name, free.axis, free.weights) == ("free_wall", "wall", {"free_wall": 1.0})
+    assert free.shape.values.shape == (SIDE, SIDE)
+    assert (said.unexplained.significant, said.unexplained.axis, said.unexplained.evidence) == (
+        True,
+        "wall",
+        90,
+    )
+    assert [s.name for s in said.screened] == ["irf_tail", "afterpulsing", "free_wall", "free_time"]
+    assert said.needed == pytest.approx(math.log(4 / 0.01))
 
 
-def test_what_is_left_is_flagged_or_not():
-    calm = [
-        discrepancy("time", 20),
-        discrepancy("wall", 3),
-        discrepancy("scan", 90, p=3e-4),
-        discrepancy("rate", -5),
-    ]
-    said = judge(findings([], calm), SPLIT, CriticismSettings())
-    assert not said.unexplained.significant  # time gains too little; scan's p-value is 1.2e-3 over four axes
-    assert said.unexplained.axis == "scan"
-    loud = [discrepancy("time", 30), discrepancy("wall", 200), *calm[2:]]
-    said = judge(findings([], loud), SPLIT, CriticismSettings())
-    assert said.unexplained.significant
-    assert (said.unexplained.axis, said.unexplained.statistic) == ("wall", 400)
-    assert not said.dominates, "nothing was named"
+@FORWARD_MODE
+def test_without_an_unknown_term_the_likeliest_axis_is_told(findings):
+    """Of the last turn's pool, which does not make it significant."""
+    found, *rest = findings
+    only = Extension([found.final.extension.effects[0]])
+    fit = fit_of(found.final.model, rest[0], only, rest[1].fit)
+    calm = dataclasses.replace(found, final=fit, turns=[found.turns[0], found.turns[2]])
+    said = diagnosed((calm, *rest))
+    assert [e.name for e in said.effects] == ["irf_tail"]
+    assert said.unknown == []
+    left = said.unexplained
+    assert (left.significant, left.axis, left.evidence) == (False, "time", 4)
+    # The map is no longer accepted, and so is a rival again.
+    assert set(said.effects[0].weights) == {"irf_tail", "afterpulsing", "free_wall"}
 
 
-@pytest.mark.parametrize(
-    ("axis", "gain", "said"), [("time", 200, "wall"), ("time", 20, "time"), ("rate", 200, "rate")]
-)
-def test_what_was_taken_back_is_unexplained_where_most_was_left(axis, gain, said):
-    """Beside 200 nats along the wall, or nothing; a map that follows the count rate says so itself."""
-    found = findings([], [discrepancy("wall", gain)])
-    taken_back = Turn([], [], [], None, [], form=Form("specular_lobe", 900.0, 1000.0, 1800.0, 0.0, axis))
-    left = judge(
-        Findings(found.base, found.final, [*found.turns, taken_back]), SPLIT, CriticismSettings()
-    ).unexplained
-    assert left.significant
-    assert left.axis == said
+@FORWARD_MODE
+def test_the_chance_is_that_of_toys_or_of_theory(findings):
+    assert diagnosed(findings).chance == pytest.approx(4 * math.exp(-500))
+    said = diagnosed(findings, Null([600.0, 3.0, 1.0]))
+    assert (said.chance, said.toys) == (0.5, 3)
 
 
-def test_names_fall_where_more_is_left_than_they_explain():
-    """32 + 32 nats on 64 select spots are one a spot; of 160 tested ones 70 nats are left, or 90."""
-    for gain, dominates in ((70, False), (90, True)):
-        said = judge(findings([32.0, 32.0], [discrepancy("time", gain)]), SPLIT, CriticismSettings())
-        assert said.unexplained.significant
-        assert said.dominates is dominates
-    # Half as many spots tested: what is left counts twice.
-    assert judge(
-        findings([32.0, 32.0], [discrepancy("time", 50)]), SPLIT, CriticismSettings(spots=80)
-    ).dominates
-    # Names must explain three quarters: three times as much.
-    assert judge(
-        findings([32.0, 32.0], [discrepancy("time", 60)]), SPLIT, CriticismSettings(explained=0.75)
-    ).dominates
-
-
-def test_names_fall_where_they_leave_much_of_their_own_kind():
-    """Two effects, predicted to gain 100 nats each on 160 tested spots, that gained ten times as much as they
-    left.
-    """
-    left = [discrepancy("scan", 100), discrepancy("time", 40)]
-    for scan, dominates in (
-        (270, True),
-        (330, False),
-        (180, False),
-    ):  # leave 37, 30 %; only 80 of 400 nats are of this kind
-        had = [discrepancy("time", 500), discrepancy("scan", scan)]
-        said = judge(
-            findings([320.0, 320.0], left, had, 100.0 if scan > 200 else 200.0), SPLIT, CriticismSettings()
-        )
-        assert said.unexplained.axis == "scan"
-        assert said.dominates is dominates
-    # Delays that neighbours share are another kind than gains, on the same axis.
-    had = [Discrepancy("scan", 270, 540, 64, 0.0, "timing_jitter"), discrepancy("scan", 90)]
-    assert not judge(findings([320.0, 320.0], left, had, 100.0), SPLIT, CriticismSettings()).dominates
-
-
-def test_toys_speak_against_what_theory_lets_pass():
-    """A tail of statistic 30: theory says 1e-6, toys of 25 ± 5 say 0.16. What theory had not asked for they
-    cannot take back.
-    """
-    found = Candidate(effect_of("irf_tail", SCAN), 30.0, 1e-6, 0.4, 12.0, None, None, {}, None)
-    assert weighed(found, None, 1e-3) == (1e-6, False)
-    p, feigned = weighed(found, Null(40, {"irf_tail": (25.0, 25.0)}, []), 1e-3)
-    assert p == pytest.approx(0.159, abs=0.01)
-    assert feigned
-    assert weighed(found, Null(40, {"irf_tail": (2.0, 4.0)}, []), 1e-3) == (1e-6, False)
-    rebuilt = Candidate(effect_of("specular_lobe", SCAN), 3.0, 0.4, 0.4, 12.0, None, None, {}, None)
-    assert weighed(rebuilt, Null(40, {"specular_lobe": (3.0, 4.0)}, []), 1e-3)[1] is False
-
-
-def test_what_is_needed_beside_an_effect_is_no_other_name_for_it():
-    def turn(name: str, group: list[str]) -> Turn:
-        accepted = Trial(
-            Candidate(effect_of(name, SCAN), 0, 0, 0, 0, None, None, {}, None),
-            None,
-            Comparison(1, 1, (0, 0)),
-            None,
-        )
-        return Turn([], [], [], accepted, group)
-
-    both = [turn("afterpulsing", ["ambient_map", "irf_tail"]), turn("ambient_map", ["afterpulsing"])]
-    assert [alternatives(t, both) for t in both] == [["irf_tail"], []]
+def test_what_would_be_seen():
+    """½(u² - 1 - ln u²) nats at u standard deviations; nine of ten cases add 1.28."""
+    for nats in (0.5, 8.3, 100.0):
+        u = visible_score(nats)
+        assert 0.5 * (u**2 - 1 - math.log(u**2)) == pytest.approx(nats, rel=1e-6)
 
 
 def test_screened_in_units_of_the_parameters():
     tail = effect_of("irf_tail", SCAN, decay=0.11)
     found = _screened(
-        Candidate(
-            tail, 30.0, 1e-6, 0.4, 12.0, torch.tensor([2.0]), torch.tensor([0.3]), {"decay": 0.11}, None
-        ),
-        None,
+        Candidate(tail, 30.0, 0.4, 1.0, {"decay": 0.11}, torch.tensor([2.0]), torch.tensor([0.3])), 8.3
     )
     assert found.one_step["fraction"] == pytest.approx(0.1)
-    assert found.detectable["fraction"] == pytest.approx(
-        5 * 0.05 * 0.3
-    )  # statistic 25 = five standard errors
-    assert (found.degrees, found.shape) == (1, {"decay": 0.11})
+    assert found.detectable["fraction"] == pytest.approx((visible_score(8.3) + 1.2816) * 0.05 * 0.3)
+    assert (found.degrees, found.shape, found.evidence) == (1, {"decay": 0.11}, 30)
     retro = effect_of("retroreflection", SCAN)
-    found = _screened(
-        Candidate(retro, 9.0, 0.1, 0.4, 1.0, torch.tensor([-1.0, 0.5]), torch.ones(2), {}, None), None
-    )
+    found = _screened(Candidate(retro, 9.0, 0.4, 1.0, {}, torch.tensor([-1.0, 0.5]), torch.ones(2)), 8.3)
     scale = {p.name: p.scale for p in retro.amplitudes}
     assert found.one_step == pytest.approx(
         {"falloff": 4 - scale["falloff"], "cosine": 1 + 0.5 * scale["cosine"]}
     )
     drift = effect_of("power_drift", SCAN)
-    null = Null(40, {"power_drift": (10.0, 20.0)}, [])
-    candidate = Candidate(
-        drift, 30.0, 1e-6, 0.4, 12.0, torch.tensor([1.0, 2, 0, 2, 0]), torch.full((5,), 0.2), {}, None
+    found = _screened(
+        Candidate(drift, 30.0, 0.4, 1.0, {}, torch.tensor([1.0, 2, 0, 2, 0]), torch.full((5,), 0.2)), 8.3
     )
-    found = _screened(candidate, null)
     assert found.one_step["drift"] == pytest.approx(0.05 * (9 / 5) ** 0.5)
-    assert found.p_value == pytest.approx(null.p_value(candidate))
-    assert found.expected == 10, "toys show twice its degrees of freedom"
     hot = effect_of("hot_spots", SCAN)
     error = torch.tensor([float("nan"), 2.0, 2.0])
-    found = _screened(Candidate(hot, 9.0, 0.1, 1.0, 1.0, torch.zeros(3), error, {}, None), None)
-    assert (found.degrees, found.expected, found.one_step) == (2, 2, {})
-    assert found.detectable["extra"] == pytest.approx(5 * hot.declared["extra"].scale * 2)
+    found = _screened(Candidate(hot, 9.0, 1.0, 1.0, {}, torch.zeros(3), error), 8.3)
+    assert (found.degrees, found.one_step) == (2, {})
+    visible = visible_score(8.3) + 1.2816
+    assert found.detectable["extra"] == pytest.approx(visible * hot.declared["extra"].scale * 2)
+
+
+def test_shapes_of_free_terms_by_hand():
+    """One coefficient each, and what it does along its axis."""
+    scene = capture_of(raster(16), scan_order=np.arange(256))
+    scan = Scan.of(scene)
+
+    def shape(name: str, k: int, value: float):
+        effect = effect_of(name, scan)
+        values = torch.zeros(effect.declared["field"].size)
+        values[k] = value
+        effect.set("field", values)
+        return effect, shape_of(effect, scan)
+
+    _, time = shape("free_time", 10, 0.3)  # bands of 58/40 bins: the eleventh holds the bin at 14.5 … 15.95
+    assert (time.axis, time.unit, len(time.edges), len(time.values)) == ("time", "1", 59, 58)
+    assert np.flatnonzero(time.values).tolist() == [15]
+    assert time.values.max() == pytest.approx(0.3)
+    _, late = shape("free_scan_delay", 23, 0.01)
+    assert (late.axis, late.unit, len(late.edges), len(late.values)) == ("scan", "m", 65, 64)
+    assert np.flatnonzero(late.values > 0.005).min() >= 60
+    assert late.values[-1] == pytest.approx(0.01)
+    _, rate = shape("free_rate", 0, 0.2)
+    assert rate.edges[[0, -1]] == pytest.approx(scan.mean_counts * np.exp([-2, 2]))
+    assert rate.values.tolist() == pytest.approx([0.2, *[0.0] * 9])
+    lines, wall = shape("free_lines", 0, 0.2)  # the first rows of x
+    assert wall.values.shape == (SIDE, SIDE)
+    assert wall.edges[0] == pytest.approx(-0.3)
+    assert wall.edges_y[-1] == pytest.approx(0.35)
+    assert np.nanmax(wall.values[SIDE // 2 :]) == 0
+    assert np.nanmean(wall.values[0]) == pytest.approx(0.2)
+    assert lines.values().shape == (256,)
+    _, both = shape("free_response_scan", 1, 0.1)
+    assert both.axis == "time×scan"
+    assert both.values.shape == (len(both.edges) - 1, len(both.edges_y) - 1)
+    assert np.abs(both.values[:4]).max() > 0
+    assert np.abs(both.values[8:]).max() == 0, "only the first sixteenth of the scan"

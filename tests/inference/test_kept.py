@@ -20,13 +20,11 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.criticise import Look
-from nlos_lit.inference.discrepancy import Discrepancy
-from nlos_lit.inference.form import Form
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.criticise import begun_with
 from nlos_lit.inference.kept import kinds
+from nlos_lit.inference.pool import screen
 from nlos_lit.inference.problem import build_problem
-from nlos_lit.inference.refit import refit_with
-from nlos_lit.inference.screen import Projector, screen
 from nlos_lit.runtime.plain_file import read_plain, write_plain
 from nlos_lit.surfels.fit import SurfelFit
 
@@ -38,7 +36,7 @@ def kept(value, scan, tmp_path, **shared):
     return read_plain(tmp_path / "x.npz", kinds(scan), shared)
 
 
-@pytest.mark.parametrize("kind", EFFECTS, ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", [*EFFECTS, *FREE], ids=lambda kind: kind.name)
 def test_effects_come_back(kind, tmp_path):
     scan = Scan.of(capture_of(raster(6)))
     effect = uneven(kind(scan))
@@ -48,6 +46,9 @@ def test_effects_come_back(kind, tmp_path):
         assert type(again) is kind
         assert (again.width, again.share, again.prior_scale) == (0.3, 0.7, 0.25)
         assert again.scan is scan
+        for (name, old), (other, new) in zip(effect.named_buffers(), again.named_buffers(), strict=True):
+            assert name == other
+            assert torch.equal(old, new)
         for (name, old), (other, new) in zip(
             effect.named_parameters(), again.named_parameters(), strict=True
         ):
@@ -77,12 +78,16 @@ def same(first: SurfelFit, second: SurfelFit) -> None:
 
 
 def test_a_fit_goes_on_to_the_same_digits(tmp_path):
-    """In the middle of an epoch, with hidden surfels, one effect held and one free."""
+    """In the middle of an epoch, with hidden surfels, one effect held, one free, and a free term."""
     scene = capture_of(raster(10))
     scan, model = Scan.of(scene), surfels(scene)
     hide_some(model)
     extension = Extension(
-        [effect_of("irf_tail", scan, fraction=0.2, decay=0.1), effect_of("hot_spots", scan)]
+        [
+            effect_of("irf_tail", scan, fraction=0.2, decay=0.1),
+            effect_of("hot_spots", scan),
+            uneven(effect_of("free_wall", scan)),
+        ]
     )
     extension.effects[1].requires_grad_(False)
     fit = fit_of(model, drawn(model, extension, scene), extension)
@@ -98,22 +103,41 @@ def test_a_fit_goes_on_to_the_same_digits(tmp_path):
     same(fit, again)
 
 
-def test_a_screening_comes_back(tmp_path):
+def test_a_pool_comes_back(tmp_path):
+    """And fits that begin with what is in it go on to the same digits."""
     scene = capture_of(raster(8))
     scan, model = Scan.of(scene), surfels(scene)
     scene = drawn(model, Extension([effect_of("irf_tail", scan, fraction=0.4, decay=0.1)]), scene)
     fit, spots = fit_of(model, scene), torch.arange(64)
     problem = build_problem(model, fit.extension, spots, fit.counts)
-    projector = Projector(problem)
-    wanted = [effect_of(name, scan) for name in ("irf_tail", "hot_spots", "power_drift")]
-    found = screen(problem, projector, wanted, spots % 6)
-    seen = Look(found, [Discrepancy("time", 1.5, 3.0, 4, 1e-3)], projector.own, Form("x", 1.0, 2.0, 3.0, 0.5))
-    again = kept(seen, scan, tmp_path)
-    assert (again.discrepancies, again.form) == (seen.discrepancies, seen.form)
-    for old, new in zip(found, again.candidates, strict=True):
-        numbers = ("statistic", "p_value", "retained", "gain", "shape", "degrees")
+    names = ("irf_tail", "hot_spots", "power_drift", "free_time", "free_wall_delay", "free_spot_gain")
+    found = screen(problem, [effect_of(name, scan) for name in names], spots % 6)
+    again = kept(found, scan, tmp_path)
+    assert [type(c) for c in again] == [type(c) for c in found]
+    for old, new in zip(found, again, strict=True):
+        numbers = ("name", "evidence", "retained", "scatter", "shape")
         assert [getattr(new, n) for n in numbers] == [getattr(old, n) for n in numbers]
-        for name in ("step", "error", "direction", "beside"):
+        assert (new.effect.prior_scale, new.effect.width) == (old.effect.prior_scale, old.effect.width)
+        for name in ("step", "error"):
             assert torch.allclose(getattr(new, name), getattr(old, name), rtol=0, atol=0, equal_nan=True)
-        refits = [refit_with(fit, [c], 2, 0) for c in (old, new)]
-        same(*refits)
+        fits = [fit.copy(begun_with(fit, [c]), 0) for c in (old, new)]
+        for one in fits:
+            one.run(1, steps=2)
+        same(*fits)
+
+
+def test_a_rebuild_that_left_nothing_comes_back(tmp_path):
+    assert kept(None, Scan.of(capture_of(raster(6))), tmp_path) is None
+
+
+@pytest.mark.parametrize("where", ["name", "stored"])
+def test_a_damaged_pool_is_refused(tmp_path, where):
+    """A term that no registry has, and coefficients of another number."""
+    scan = Scan.of(capture_of(raster(6)))
+    wide = effect_of("free_rate", scan)
+    if where == "name":
+        wide.name = "free_will"
+    else:
+        wide.raw_field = torch.nn.Parameter(torch.zeros(3))
+    with pytest.raises(UserError, match="damaged"):
+        kept(wide, scan, tmp_path)

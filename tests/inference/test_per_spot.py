@@ -12,8 +12,8 @@ from scipy import integrate
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.per_spot import best_width, coefficients, factors, solve, sparse, spot_scores
-from nlos_lit.inference.refit import log_likelihood
 
 pytestmark = FORWARD_MODE
 

@@ -1,0 +1,400 @@
+"""The evidence of a term, by hand and against dense algebra; the pool on linear problems."""
+
+from __future__ import annotations
+
+import copy
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+import torch
+from inference_scenes import capture_of, effect_of, problem_of, scattered
+from scipy import stats
+from torch import Tensor
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects.effect import Effect
+from nlos_lit.inference import pool
+from nlos_lit.inference.evidence import (
+    VARIANCES,
+    Evidence,
+    Projector,
+    evidence,
+    half_products,
+    prior_deviations,
+    step_bounds,
+)
+from nlos_lit.inference.pool import Candidate, screen
+from nlos_lit.inference.problem import Problem
+
+SPOTS, BINS, DRAWS = 42, 6, 200
+ROWS = SPOTS * BINS
+SCAN = Scan.of(capture_of(scattered(SPOTS)))
+BLOCK = torch.arange(SPOTS)
+
+
+def normal(*shape: int, seed: int) -> Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).standard_normal(shape)).float()
+
+
+def best(u: float) -> float:
+    """Nats of one coefficient of ``u`` standard deviations, where τ is as the counts want it."""
+    return 0.5 * (u**2 - 1 - math.log(u**2))
+
+
+def one(
+    scores: list[float],
+    information: list[float],
+    deviation: float = 1.0,
+    bounds: tuple[float, float] | None = None,
+) -> Evidence:
+    """One column, one spot of one bin in each block, with these scores and information."""
+    f = torch.tensor(information)
+    z = f.sqrt()[:, None, None]
+    residual = torch.tensor(scores)[:, None] / f.sqrt()[:, None]
+    limits = None if bounds is None else tuple(torch.tensor([b]).double() for b in bounds)
+    return evidence(z, z, residual, torch.arange(len(f)), torch.tensor([deviation]).double(), limits)
+
+
+def test_one_coefficient_by_hand():
+    """Information 15 and a score of 4 standard deviations: τ² = (16 - 1)/15 = 1, and ½(16 - 1 - ln 16) nats;
+    the mean is 15/16 of the estimate.
+    """
+    found = one([4 * 15**0.5], [15.0])
+    assert found.nats == pytest.approx(0.5 * (15 - math.log(16)), rel=1e-6)
+    assert found.scale == pytest.approx(1)
+    assert found.step.item() == pytest.approx(15 / 16 * 4 / 15**0.5, rel=1e-6)
+    assert found.error.item() == pytest.approx(15**-0.5, rel=1e-6)
+    assert (found.retained, found.scatter) == (pytest.approx(1), 1)
+
+
+@pytest.mark.parametrize("u", [2.5, -5.0, 30.0])
+def test_evidence_grows_with_the_square_of_the_score(u):
+    """Whatever the unit; τ is tried so finely that 0.02 nats are lost at most."""
+    for information, deviation in ((7.0, 1.0), (7e4, 0.01), (0.07, 10.0)):
+        found = one([u * information**0.5], [information], deviation)
+        assert best(u) - 0.02 < found.nats < best(u) + 1e-5
+        shrunk = 1 / (1 + 1 / (found.scale**2 * information * deviation**2))
+        assert found.step.item() == pytest.approx(shrunk * u / information**0.5, rel=1e-5)
+        assert found.error.item() == pytest.approx(information**-0.5, rel=1e-5)
+
+
+def test_several_coefficients_are_a_gaussian_process():
+    """Against the marginal likelihood of the counts themselves, with covariance I + τ²ZCZᵀ, and its mean."""
+    z = normal(ROWS, 4, seed=1) * torch.tensor([1.0, 0.3, 2.0, 0.1])
+    z[:, 3] += z[:, 0]
+    deviation = torch.tensor([1.0, 3.0, 0.1, 0.5]).double()
+    residual = z @ torch.tensor([0.5, -1.0, 0.1, 0.2]) + normal(ROWS, seed=2)
+    shape = (SPOTS, BINS, -1)
+    found = evidence(
+        z.view(shape),
+        z.view(shape),
+        residual.view(SPOTS, BINS),
+        torch.zeros(SPOTS, dtype=torch.long),
+        deviation,
+    )
+    assert found.scatter == 1
+    wide = z.double().numpy() * deviation.numpy()
+    r = residual.double().numpy()
+
+    def nats(variance: float) -> float:
+        return stats.multivariate_normal.logpdf(r, cov=np.eye(ROWS) + variance * wide @ wide.T)
+
+    tried = [nats(v) for v in VARIANCES]
+    assert found.nats == pytest.approx(max(tried) - nats(0.0), rel=1e-4)
+    variance = VARIANCES[int(np.argmax(tried))]
+    assert found.scale**2 == pytest.approx(variance)
+    mean = variance * wide.T @ np.linalg.solve(np.eye(ROWS) + variance * wide @ wide.T, r)
+    assert found.step.numpy() == pytest.approx(mean * deviation.numpy(), rel=1e-3)
+    alone = np.linalg.inv(z.double().numpy().T @ z.double().numpy()).diagonal() ** 0.5
+    assert found.error.numpy() == pytest.approx(alone, rel=1e-3)
+
+
+def test_coefficients_keep_within_their_bounds():
+    """Information 4 and a score of 16 ask for 4. No more than 1.5 allowed, that is what is taken: it is worth
+    1.5·16 - ½·1.5²·4 nats, less what τ costs.
+    """
+    free = one([16.0], [4.0])
+    assert one([16.0], [4.0], bounds=(0.0, 9.0)).nats == free.nats
+    bound = one([16.0], [4.0], bounds=(0.0, 1.5))
+    assert bound.step.item() == pytest.approx(1.5)
+    costs = [0.5 * 1.5**2 / v + 0.5 * math.log(1 + v * 4) for v in VARIANCES]
+    assert bound.nats == pytest.approx(1.5 * 16 - 0.5 * 1.5**2 * 4 - min(costs), abs=0.05)
+    assert one([16.0], [4.0], deviation=0.1, bounds=(0.0, 1.5)).step.item() == pytest.approx(1.5)
+    nothing = one([-16.0], [4.0], bounds=(0.0, 9.0))
+    assert (nothing.nats, nothing.scale, nothing.step.item()) == (0, 0, 0)
+
+
+def test_no_score_is_no_evidence():
+    found = one([0.0, 0.0], [4.0, 9.0])
+    assert (found.nats, found.scale, found.step.item()) == (0, 0, 0)
+    assert found.error.item() == pytest.approx(13**-0.5)
+
+
+def test_blocks_that_contradict_each_other_take_the_evidence():
+    """Information 50 in each of two blocks, and scores of 60 in all: alike, they are 6 standard deviations.
+    60 and 0 are 30 off the common coefficient each, which is a scatter of 2·30²/100 = 18, and leaves √2
+    standard deviations, with an error √18 times as large.
+    """
+    alike, apart = one([30.0, 30.0], [50.0, 50.0]), one([60.0, 0.0], [50.0, 50.0])
+    assert alike.nats == pytest.approx(best(6), abs=0.02)
+    assert (alike.scatter, alike.error.item()) == (1, pytest.approx(0.1))
+    assert apart.scatter == pytest.approx(18, rel=0.01)
+    assert apart.nats == pytest.approx(best(2**0.5), abs=0.02)
+    assert apart.error.item() == pytest.approx(0.1 * 18**0.5, rel=0.01)
+
+
+def test_deviations_are_those_of_the_prior():
+    """In stored units, whatever scale the prior has at present; a noticeable step where there is none."""
+    drift = effect_of("power_drift", SCAN)
+    p = drift.declared["drift"]
+    drift.prior_scale = 0.1
+    assert prior_deviations(drift).tolist() == pytest.approx([d / p.scale for d in p.prior], rel=1e-5)
+    assert prior_deviations(effect_of("time_offset", SCAN)).tolist() == [1]
+    assert prior_deviations(effect_of("free_rate", SCAN)).tolist() == pytest.approx([10.0] * 10)
+
+
+def test_bounds_are_steps_from_the_null():
+    """In stored units; a fraction cannot be less than 0."""
+    for name in ("irf_tail", "retroreflection", "power_drift"):
+        effect = effect_of(name, SCAN)
+        low, high = step_bounds(effect)
+        p = effect.amplitudes[0]
+        assert float(low[0]) == pytest.approx((p.lower - p.null) / p.scale)
+        assert float(high[0]) == pytest.approx((p.upper - p.null) / p.scale)
+        assert len(low) == len(high) == sum(p.size for p in effect.amplitudes)
+    assert float(step_bounds(effect_of("irf_tail", SCAN))[0]) == 0
+
+
+def test_projection_is_orthogonal_to_the_nuisance_and_moves_nothing_else():
+    x, z = normal(ROWS, 7, seed=1), normal(ROWS, 3, seed=9)
+    projector = Projector(problem(normal(ROWS, seed=2), x))
+    off = projector.off(z)
+    assert float((x.T @ off).abs().max()) < 1e-3 * float((x.T @ z).abs().max())
+    assert float((off - (z - x @ torch.linalg.lstsq(x, z).solution)).abs().max()) < 1e-5
+    assert torch.allclose(projector.off(off), off, atol=1e-5)
+    mixture = x @ normal(7, 2, seed=5)
+    assert float(projector.off(mixture).abs().max()) < 1e-4 * float(mixture.abs().max())
+    assert torch.equal(projector.residual, projector.off(normal(ROWS, seed=2)[:, None])[:, 0])
+
+
+def test_a_prior_leaves_part_of_the_column():
+    """One column x with precision 3: what is left of itself is x · 3/(xᵀx + 3)."""
+    x = torch.full((ROWS, 1), 0.1)
+    left = Projector(problem(torch.zeros(ROWS), x, torch.tensor([3.0]))).off(x)
+    assert float(left[0]) == pytest.approx(0.1 * 3 / (ROWS * 0.01 + 3), rel=1e-4)
+
+
+@pytest.mark.parametrize("columns", [1, 4, 6, 7])
+def test_half_of_the_products_are_all(columns):
+    x = normal(ROWS, columns, seed=21)
+    assert torch.allclose(half_products(x, block=3), x.T @ x, rtol=1e-5, atol=1e-4)
+
+
+def test_dependent_columns_do_not_break_the_projection():
+    x = normal(ROWS, 7, seed=1)
+    twice = torch.cat([x, x[:, :3], torch.zeros(ROWS, 1)], 1)
+    z = normal(ROWS, 2, seed=9)
+    assert torch.allclose(
+        Projector(problem(z[:, 0], twice)).off(z), Projector(problem(z[:, 0], x)).off(z), atol=1e-3
+    )
+
+
+def test_a_fit_with_infinite_sensitivities_cannot_be_criticised():
+    x = normal(ROWS, 2, seed=1)
+    x[3, 1] = float("inf")
+    with pytest.raises(ValueError, match="not finite"):
+        Projector(problem(torch.zeros(ROWS), x))
+
+
+def problem(residual: Tensor, nuisance: Tensor | None = None, prior: Tensor | None = None) -> Problem:
+    x = normal(ROWS, 7, seed=1) if nuisance is None else nuisance
+    return problem_of(torch.arange(SPOTS), torch.ones(SPOTS, BINS), x, residual, prior)
+
+
+def columns(effect: Effect, strength: float = 10.0) -> Tensor:
+    """``[N, k]``, its own for every shape, partly what nuisance can do."""
+    k = sum(p.size for p in effect.amplitudes)
+    shape = sum(float(effect.value(p.name).detach()) for p in effect.shapes)
+    return strength / ROWS**0.5 * own_columns(k, 2 + int(1000 * shape))
+
+
+@lru_cache
+def own_columns(k: int, seed: int) -> Tensor:
+    return normal(ROWS, k, seed=seed) + normal(ROWS, 7, seed=1)[:, :k]
+
+
+@pytest.fixture
+def known(monkeypatch):
+    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: columns(effect))
+
+
+def look(name: str, residual: Tensor) -> Candidate:
+    (candidate,) = screen(problem(residual), [effect_of(name, SCAN)], BLOCK)
+    return candidate
+
+
+def residuals(truth: Tensor, seed: int) -> list[Tensor]:
+    """Unit noise plus nuisance of any size plus ``truth`` ``[N]``."""
+    base = normal(ROWS, 7, seed=1) @ (3 * normal(7, seed=seed))
+    return [base + truth + normal(ROWS, seed=1000 * seed + d) for d in range(DRAWS)]
+
+
+@pytest.mark.parametrize("name", ["time_offset", "irf_tail", "power_drift", "tcspc_nonlinearity"])
+def test_counts_alone_seldom_give_evidence(name, known):
+    """A mean Bayes factor of 1 lets one draw in e⁴ = 55 pass 4 nats; with τ where it is largest it is still
+    no more than that, whether there are one, five or many coefficients, and many shapes.
+    """
+    found = np.array([look(name, r).evidence for r in residuals(torch.zeros(ROWS), seed=3)])
+    assert found.max() > -10
+    assert (found > 4).mean() <= math.exp(-4)
+    assert np.exp(found).mean() < 3
+
+
+def test_one_step_is_unbiased_and_its_error_right(known):
+    effect = effect_of("power_drift", SCAN)
+    truth = torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0])
+    found = [look("power_drift", r) for r in residuals(columns(effect) @ truth, seed=4)]
+    steps = torch.stack([c.step for c in found])
+    z = Projector(problem(torch.zeros(ROWS))).off(columns(effect)).double()
+    errors = torch.linalg.inv(z.T @ z).diagonal().sqrt().float()
+    assert torch.all((steps.mean(0) - truth).abs() < 4 * errors / math.sqrt(DRAWS) + 0.02 * truth.abs())
+    assert torch.allclose(steps.std(0), errors, rtol=4 / math.sqrt(2 * DRAWS))
+    ratio = torch.stack([c.error for c in found]) / errors
+    assert torch.all(ratio >= 0.999), "errors are no smaller than counts alone leave them"
+    assert torch.all(ratio.mean(0) < 1.2)
+    assert min(c.evidence for c in found) > 100
+
+
+def test_what_the_base_can_imitate_has_no_evidence(monkeypatch):
+    """The nuisance explains the residual as well, however large it is."""
+    x = normal(ROWS, 7, seed=1)
+    monkeypatch.setattr(pool, "weighted_columns", lambda *_, **__: 10 * x[:, :1] + 5 * x[:, 3:4])
+    for name in ("time_offset", "irf_tail"):
+        found = look(name, 30 * x[:, 0] + 30 * x[:, 3] + normal(ROWS, seed=8))
+        assert found.evidence < 0.5
+        assert found.retained < 1e-4
+
+
+def test_retained_information_is_what_the_base_leaves(known):
+    """The column is √½ nuisance and √½ its own."""
+    x = normal(ROWS, 7, seed=1)
+    z = columns(effect_of("time_offset", SCAN))[:, 0]
+    left = z - x @ torch.linalg.lstsq(x, z[:, None]).solution[:, 0]
+    found = look("time_offset", normal(ROWS, seed=8))
+    assert found.retained == pytest.approx(float((left**2).sum() / (z**2).sum()), rel=1e-3)
+    assert 0.4 < found.retained < 0.6
+
+
+def test_every_shape_that_could_have_been_counts(monkeypatch):
+    """One of many periods has evidence: its Bayes factor over their number. Two alike: twice as much."""
+    grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
+    right = {grid[29]["period"]}
+
+    def ripple(problem: Problem, effect: Effect, *_: object, **__: object) -> Tensor:
+        period = float(effect.value("period").detach())
+        near = min(grid, key=lambda shape: abs(shape["period"] - period))["period"]
+        return own_columns(2, 5 if near in right else 100 + int(1000 * near)) * 10 / ROWS**0.5
+
+    monkeypatch.setattr(pool, "weighted_columns", ripple)
+    truth = own_columns(2, 5) @ torch.tensor([3.0, -4.0]) * 10 / ROWS**0.5 + normal(ROWS, seed=7)
+    alone = look("tcspc_nonlinearity", truth)
+    assert alone.shape["period"] == grid[29]["period"]
+    assert float(alone.effect.value("period").detach()) == pytest.approx(grid[29]["period"])
+    whole, z = problem(truth), own_columns(2, 5) * 10 / ROWS**0.5
+    projector = Projector(whole)
+    shape = (SPOTS, BINS, -1)
+    nats = evidence(
+        z.view(shape),
+        projector.off(z).view(shape),
+        projector.residual.view(SPOTS, BINS),
+        BLOCK,
+        prior_deviations(alone.effect),
+    ).nats
+    assert alone.evidence == pytest.approx(nats - math.log(len(grid)), abs=1e-3)
+    right.add(grid[20]["period"])
+    assert look("tcspc_nonlinearity", truth).evidence == pytest.approx(alone.evidence + math.log(2), abs=1e-3)
+
+
+def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
+    """Of all periods only the 16 most promising are projected; the right one is among them."""
+
+    def ripple(period: float) -> Tensor:
+        phase = 2 * math.pi * torch.arange(ROWS) / period
+        return torch.stack([phase.sin(), phase.cos()], 1)
+
+    monkeypatch.setattr(
+        pool, "weighted_columns", lambda problem, effect, *_: ripple(float(effect.value("period").detach()))
+    )
+    grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
+    assert len(grid) > 2 * pool.KEPT
+    period = grid[29]["period"]
+    passes, off = [], Projector.off
+    monkeypatch.setattr(Projector, "off", lambda self, z: passes.append(z.shape[1]) or off(self, z))
+    found = look("tcspc_nonlinearity", ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
+    assert passes == [1, 2 * pool.KEPT]  # the residual, then all columns at once
+    assert found.shape["period"] == period
+
+
+def test_terms_are_projected_together(monkeypatch, known):
+    """No more than some columns at a time, and each term gets its own again."""
+    given = [effect_of(n, SCAN) for n in ("irf_tail", "power_drift", "time_offset", "gate_edges")]
+    truth = columns(given[1]) @ torch.tensor([4.0, -4.0, 4.0, -4.0, 4.0]) + normal(ROWS, seed=11)
+    together = screen(problem(truth), given, BLOCK)
+    monkeypatch.setattr(pool, "TOGETHER", 1)
+    apart = screen(problem(truth), given, BLOCK)
+    assert together[0].name == "power_drift"
+    assert [c.evidence for c in together] == sorted((c.evidence for c in together), reverse=True)
+    assert [c.name for c in together] == [c.name for c in apart]
+    assert [c.evidence for c in together] == pytest.approx([c.evidence for c in apart], abs=1e-3)
+
+
+def test_a_term_with_a_prior_keeps_its_scale(known):
+    effect = effect_of("power_drift", SCAN)
+    truth = columns(effect) @ torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0]) + normal(ROWS, seed=5)
+    found = look("power_drift", truth)
+    ratio = found.step / prior_deviations(effect).float()
+    assert found.effect.prior_scale in VARIANCES**0.5
+    assert found.effect.prior_scale == pytest.approx(float(ratio.square().mean().sqrt()), rel=0.5)
+    assert look("power_drift", torch.zeros(ROWS)).effect.prior_scale == 1
+
+
+def test_screening_leaves_the_effects_it_is_given_alone(known):
+    given = [effect_of(n, SCAN) for n in ("irf_tail", "power_drift")]
+    before = copy.deepcopy(given)
+    whole = problem(columns(effect_of("irf_tail", SCAN))[:, 0] + normal(ROWS, seed=11))
+    found = screen(whole, given, BLOCK)
+    assert not {id(c.effect) for c in found} & {id(e) for e in given}
+    for effect, old in zip(given, before, strict=True):
+        assert effect.prior_scale == old.prior_scale
+        for value, was in zip(effect.parameters(), old.parameters(), strict=True):
+            assert torch.equal(value, was)
+
+
+def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
+    """Column 1 at every bin of a spot, F = 6 a spot: δ ~ N(0, 1.5²) is seen as an excess of scatter, and no
+    scatter as none.
+    """
+    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
+    delta = 1.5 * normal(SPOTS, seed=12)
+    nuisance = 1e-6 * normal(ROWS, 2, seed=13)
+    wide = problem(delta.repeat_interleave(BINS) + normal(ROWS, seed=14), nuisance)
+    wide.spots = torch.arange(SPOTS) + 2
+    wide.model = type("Model", (), {"laser": torch.zeros(SPOTS + 3, 3)})()
+    (found,) = screen(wide, [effect_of("timing_jitter", SCAN)], BLOCK)
+    assert found.effect.width == pytest.approx(1.5, rel=0.3)
+    grown = 1 + 6 * found.effect.width**2
+    score = Projector(wide).residual.view(SPOTS, BINS).sum(1).double()
+    by_hand = 0.5 * (found.effect.width**2 * score**2 / grown - math.log(grown)).sum()
+    assert found.evidence == pytest.approx(float(by_hand), rel=1e-3)
+    assert found.evidence > 20
+    assert found.step.shape == (SPOTS + 3,)
+    assert torch.equal(found.step[[0, 1, SPOTS + 2]], torch.zeros(3))
+    assert np.corrcoef(found.step[2:-1], delta)[0, 1] > 0.95
+    assert found.error[5].item() == pytest.approx(6**-0.5, rel=1e-4)
+    assert torch.isnan(found.error[0])
+    calm = problem(0.8 * normal(ROWS, seed=14), nuisance)
+    calm.model = type("Model", (), {"laser": torch.zeros(SPOTS, 3)})()
+    (nothing,) = screen(calm, [effect_of("timing_jitter", SCAN)], BLOCK)
+    assert nothing.evidence < 0.5

@@ -1,0 +1,227 @@
+"""Free terms: what each coefficient does, and whether the pool finds each where it is planted, and the named
+effect where that is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from inference_scenes import BIN, FORWARD_MODE, GATE, capture_of, drawn, effect_of, raster, surfels, uneven
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, bands, response_changes, time_bands
+from nlos_lit.inference import pool
+from nlos_lit.inference.pool import Candidate, screen
+from nlos_lit.inference.problem import build_problem
+
+SIDE = 16
+SCENE = capture_of(raster(SIDE))
+SCAN = Scan.of(SCENE)
+SPOTS = torch.arange(SIDE**2)
+
+
+def with_one(name: str, k: int, value: float) -> Effect:
+    effect = effect_of(name, SCAN)
+    values = torch.zeros(effect.declared["field"].size)
+    values[k] = value
+    effect.set("field", values)
+    return effect
+
+
+def test_names_are_unlike_those_of_the_registry():
+    assert len(FREE_NAMES) == len(FREE)
+    assert not FREE_NAMES & set(EFFECTS.names)
+    axes = {term.axis for term in FREE}
+    assert axes == {"time", "wall", "scan", "rate", "time×scan", "time×wall", "spot"}
+
+
+@pytest.mark.parametrize("term", FREE, ids=lambda t: t.name)
+def test_the_null_changes_nothing_and_the_rest_does(term):
+    model = surfels(SCENE)
+    effect = term(SCAN)
+    before = model.expected(SPOTS)
+    assert torch.allclose(model.expected(SPOTS, Extension([effect])), before, rtol=3e-5)
+    assert effect.penalty() == 0
+    assert not torch.allclose(model.expected(SPOTS, Extension([uneven(effect)])), before, rtol=1e-2)
+    if not effect.per_spot:
+        assert effect.quantities()["rms"].value > 0
+        assert torch.all(effect.precision() > 0), "every coefficient has the same prior deviation"
+        assert len(set(effect.precision().tolist())) == 1
+
+
+def test_bands_by_hand():
+    assert bands(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).argmax(1).tolist() == [0, 0, 1, 3, 3]
+    time = time_bands(SCAN, 40)
+    assert time.shape == (GATE[1], 40)
+    assert not time[: GATE[0]].any()
+    assert torch.equal(time[GATE[0] :].sum(1), torch.ones(58))
+    assert time[GATE[0] :].argmax(1).tolist() == [k * 40 // 58 for k in range(58)]
+
+
+@pytest.mark.parametrize("name", ["free_wall", "free_lines", "free_scan", "free_rate", "free_time"])
+def test_factors_of_counts_by_hand(name):
+    """Coefficient 3 multiplies counts by e to the 0.1 times its function, for light and background alike."""
+    effect, expected = with_one(name, 3, 0.1), 1 + torch.rand(256, 64)
+    if name == "free_rate":  # ten knots from e⁻² to e² of the mean: the fourth lies at -2 + 3·4/9
+        rate = (expected.sum(1) / SCAN.mean_counts).log()
+        function = (1 - ((rate + 2) * 9 / 4 - 3).abs()).clamp_min(0)[:, None]
+        expected = expected * torch.exp(torch.linspace(-1.9, 1.9, 256))[:, None] * SCAN.mean_counts / 96
+        rate = (expected.sum(1) / SCAN.mean_counts).log()
+        function = (1 - ((rate + 2) * 9 / 4 - 3).abs()).clamp_min(0)[:, None]
+        assert function.max() > 0.9
+    elif name == "free_time":
+        function = effect.functions[:, 3]
+        assert function.nonzero()[:, 0].tolist() == [GATE[0] + 5]  # 58/40 bins a band: 4.35 … 5.8
+    elif name == "free_scan":
+        function = ((SCAN.rank + 1) * 32).long().eq(3).float()[:, None]
+        assert function.sum() == 4
+    elif name == "free_lines":
+        function = (SCAN.laser[:, 0] - SCAN.laser[:, 0].min()) / 0.8 * 24
+        function = function.long().eq(3).float()[:, None]
+        assert function.sum() == SIDE
+    else:
+        function = effect.functions[:, 3:4]
+        assert effect.functions.square().mean(0).tolist() == pytest.approx([1.0] * 63, rel=1e-4)
+        assert effect.functions.mean(0).abs().max() < 1e-4
+    found = effect.counting(expected, SPOTS)
+    assert torch.allclose(found, expected * torch.exp(0.1 * function), rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["free_scan_background", "free_wall_background"])
+def test_factors_of_the_background_by_hand(name):
+    effect, background = with_one(name, 2, 0.4), torch.full((256, 64), 3.0)
+    found = effect.background(background, SPOTS)
+    assert torch.allclose(found, 3 * torch.exp(0.4 * effect.functions[:, 2:3]).expand(-1, 64))
+    assert "counting" not in effect.hooks
+
+
+@pytest.mark.parametrize("name", ["free_scan_delay", "free_wall_delay"])
+def test_delays_by_hand(name):
+    """Two centimetres are a bin."""
+    effect = with_one(name, 2, BIN)
+    found = effect.time(torch.ones(256, 5, 4), None, SPOTS)
+    assert torch.allclose(found, 1 + BIN * effect.functions[:, 2, None, None].expand(-1, 5, 4))
+    assert effect.amplitudes[0].scale == pytest.approx(BIN)
+
+
+def test_changes_of_the_response_by_hand():
+    """Widening takes 2 for each 1 to either side; a tail takes 1 and gives (1 - e^{-1/τ}) e^{-t/τ}."""
+    changes = response_changes(400)
+    assert changes[0, 198:203, 200].tolist() == [0, 1, -2, 1, 0]
+    for k, tail in enumerate(TAILS, 1):
+        share = 1 - np.exp(-1 / tail)
+        assert not changes[k, :200, 200].any()
+        assert changes[k, 200:203, 200].tolist() == pytest.approx(
+            [share - 1, share * np.exp(-1 / tail), share * np.exp(-2 / tail)], rel=1e-4
+        )
+    assert changes[:, :, 10].sum(1).abs().max() < 1e-3, "energy is kept"
+    signal = torch.zeros(256, 64)
+    signal[:, 20] = 100.0
+    effect = with_one("free_response_scan", 1, 0.1)  # the first stretch, the shortest tail
+    found, mine = effect.gain(signal, SPOTS).detach(), SCAN.rank < -1 + 2 / 16
+    assert torch.equal(found[~mine], signal[~mine])
+    share = 1 - np.exp(-1 / TAILS[0])
+    assert found[mine][0, 19:22].tolist() == pytest.approx(
+        [0, 90 + 10 * share, 10 * share * np.exp(-1 / TAILS[0])], rel=1e-4
+    )
+    assert effect.values().detach()[mine][0, GATE[0]] == pytest.approx(0.1 * (share - 1))
+
+
+def test_single_spots_by_hand():
+    effect = with_one("free_spot_gain", 7, 0.2)
+    found = effect.counting(torch.ones(256, 64), SPOTS).detach()
+    assert torch.nonzero(found[:, 0] != 1)[:, 0].tolist() == [7]
+    assert found[7, 0] == pytest.approx(np.exp(0.2))
+    effect.width = 3.0
+    assert effect.quantities()["rms"].value == pytest.approx(0.15)
+
+
+RIVALS = ("time_drift", "timing_jitter", "time_offset", "power_drift", "wall_reflectance", "ambient_map")
+RIVALS += (
+    "vignetting",
+    "background_slope",
+    "hot_spots",
+    "pile_up",
+)  # those whose columns are soon worked out
+
+
+def planted(effect: Effect, seed: int) -> list[Candidate]:
+    """What free terms and some of the registry are worth about counts that are drawn with an effect."""
+    names = {*FREE_NAMES, *RIVALS, effect.name}
+    model = surfels(SCENE, level=4.0)
+    measured = drawn(model, Extension([effect]), SCENE, seed)
+    problem = build_problem(model, Extension([]), SPOTS, torch.from_numpy(measured.gated_counts()))
+    return screen(problem, [e(SCAN) for e in [*EFFECTS, *FREE] if e.name in names], SPOTS // 32)
+
+
+def rough(name: str, size: float) -> Effect:
+    """Random coefficients, so that f is ``size`` on average."""
+    effect = effect_of(name, SCAN)
+    p = effect.declared["field"]
+    values = 0.1 * p.scale * torch.from_numpy(np.random.default_rng(3).standard_normal(p.size)).float()
+    effect.set("field", values)
+    effect.set("field", values * size / float(effect.values().detach().square().mean().sqrt()))
+    return effect
+
+
+SIZES = {"free_scan_delay": 0.2 * BIN, "free_wall_delay": 0.2 * BIN, "free_scan_background": 0.3}
+SIZES |= {"free_wall_background": 0.3, "free_response_scan": 0.01, "free_response_wall": 0.01}
+
+
+@FORWARD_MODE
+@pytest.mark.parametrize("name", [term.name for term in FREE])
+def test_what_is_planted_is_asked_for_first(name):
+    """A random shape along the axis, which no effect of the registry has."""
+    found = planted(rough(name, SIZES.get(name, 0.1)), seed=1)
+    assert found[0].name == name, [(c.name, round(c.evidence)) for c in found[:4]]
+    assert found[0].evidence > 50
+
+
+NAMED = {
+    "power_drift": ({"drift": 0.05}, "free_scan"),
+    "wall_reflectance": ({"gain_map": 0.05}, "free_wall"),
+    "time_drift": ({"drift": 0.05 * BIN}, "free_scan_delay"),
+    "ambient_map": ({"level_map": 0.2}, "free_wall_background"),
+    "irf_tail": ({"fraction": 0.1}, "free_time"),
+    "background_slope": ({"slope": 0.3}, "free_time"),
+    "pile_up": ({"detections": 0.1}, "free_rate"),
+    "hum": ({"cosine": 0.3}, "free_scan_background"),
+    "tcspc_nonlinearity": ({"sine": 0.05}, "free_time"),
+}
+
+
+@FORWARD_MODE
+@pytest.mark.parametrize("name", NAMED)
+def test_a_named_effect_has_more_evidence_than_the_free_term_along_its_axis(name):
+    """Where its own coefficients are, the smoothest two of them that are not zero."""
+    values, free = NAMED[name]
+    effect = effect_of(name, SCAN)
+    for p in effect.amplitudes:
+        if p.name not in values:
+            continue
+        coefficients = torch.zeros(p.size)
+        coefficients[:2] = values[p.name] * torch.tensor([1.0, -0.5])[: p.size]
+        effect.set(p.name, coefficients[0] if p.size == 1 else coefficients)
+        values = {}
+    assert not values, "no such parameter"
+    found = {c.name: c.evidence for c in planted(effect, seed=2)}
+    assert found[name] > found[free], sorted(found.items(), key=lambda kv: -kv[1])[:4]
+    assert found[name] > 20
+
+
+def test_rows_are_a_fixed_choice_of_the_fitted_ones():
+    class Split:
+        fit = np.arange(100, 200)
+
+    rows = pool.tested_rows(None, Split, 30, seed=3)
+    assert np.array_equal(rows, np.unique(rows))
+    assert len(rows) == 30
+    assert rows[0] >= 0
+    assert rows[-1] < 100
+    assert np.array_equal(rows, pool.tested_rows(None, Split, 30, seed=3))
+    assert not np.array_equal(rows, pool.tested_rows(None, Split, 30, seed=4))
+    assert np.array_equal(pool.tested_rows(None, Split, 1000, seed=3), np.arange(100))
