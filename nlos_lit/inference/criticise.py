@@ -46,7 +46,8 @@ class CriticismSettings:
         spots: fitted spots that the pool is asked on at most.
         level: chance of a false name that is borne: a term needs ln(terms in the pool/level) nats of
             evidence.
-        errors: standard errors by which a gain on other spots must exceed 0.
+        errors: standard errors by which predictions of other spots must differ to count as different.
+        sure: standard errors that a term's absence must cost, beside a fine scene, for the term to be kept.
         rivals: terms with which the fit goes on in a turn. finalists: of them, with which the scene is
             rebuilt from new seeds, too; the one with the most evidence is always among them.
         open_share: weight from which on a rival belongs to what the capture cannot tell from the best.
@@ -58,6 +59,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 0.01
     errors: float = 2.0
+    sure: float = 3.0
     rivals: int = 4
     finalists: int = 2
     open_share: float = 0.05
@@ -119,8 +121,8 @@ class Findings:
         base: the fit without effects, as fine as the final one.
         final: the fit with all terms that were kept.
         turns: of the loop.
-        losses: what each kept term's absence costs on the select spots, once the scene is rebuilt without.
-        again: another fit with the terms of the final one; None where there is none.
+        losses: what each kept term's absence costs on the select spots, beside a fine scene.
+        again: the fit with these terms before the scene was refined; None where there is none.
     """
 
     base: SurfelFit
@@ -288,7 +290,7 @@ class Loop:
             more = ("refining the scene", None, partial(self.grow, fit, self.seed + 1))
         controls = self._trials(fit, [more])
         trials = weighed([*asked, *controls], self.block)
-        if best is not None and all(self._beats(best, control) for control in controls):
+        if best is not None and not any(self._beats(control, best) for control in controls):
             best = next(t for t in trials if t.candidate is best.candidate)
             group = [t.name for t in trials if t.candidate and t is not best and t.weight > s.open_share]
             return Turn(candidates, trials, best, group, grown)
@@ -311,9 +313,9 @@ class Loop:
         fit.run(1, steps=WARM, settle=False)
         return solve_spots(fit)
 
-    def _beats(self, trial: Trial, control: Trial) -> bool:
-        """It predicts better than more scene does, by more than the difference's error."""
-        gain = compare(control.likelihood, trial.likelihood, self.block)
+    def _beats(self, one: Trial, other: Trial) -> bool:
+        """It predicts better than the other, by more than the difference's error."""
+        gain = compare(other.likelihood, one.likelihood, self.block)
         return gain.nats > self.settings.errors * gain.error
 
     def _trials(self, fit: SurfelFit, jobs: list[Job]) -> list[Trial]:
@@ -327,36 +329,45 @@ class Loop:
                 trials.append(Trial(c, again, value, compare(before, value, self.block)))
         return trials
 
+    def refined(self, fit: SurfelFit, without: str = "") -> SurfelFit:
+        """The scene gone on with without one of its terms, then as fine as the counts ask for."""
+        return solve_spots(self.grow(self._without(fit, without) if without else fit, self.seed))
+
     def drop_needless(self, fit: SurfelFit) -> tuple[SurfelFit, dict[str, Comparison]]:
-        """Backward: without which terms does the scene, gone on with, predict as well?
+        """Backward: without which terms does a fine scene predict as well?
+
+        A parsimonious scene lets effects be seen, and lets them stand for what it lacks. So each has to be
+        missed once the scene is as fine as the counts ask for, with it and without it.
 
         Args:
             fit: with all accepted terms.
 
         Returns:
-            the fit without needless terms, and what each other one's absence costs.
+            the fine fit without needless terms, and what each other one's absence costs.
         """
-        losses: dict[str, Comparison] = {}
         while True:
             names = [e.name for e in fit.extension.effects]
             if not names:
                 return fit, {}
-            jobs = []
+            jobs: list[tuple[str, str, Callable[[], SurfelFit]]] = [
+                ("refining the scene", f"fine_{len(names)}", partial(self.refined, fit))
+            ]
             for name in names:
                 key = f"without_{name}_of_{len(names)}"
-                jobs.append((f"going on without {name}", key, partial(self._without, fit, name)))
+                jobs.append((f"refining the scene without {name}", key, partial(self.refined, fit, name)))
             self.steps.plan(fit=len(jobs))
-            rebuilt = self.steps.several("fit", jobs, self.settings.processes)
-            value = log_likelihood(fit, self.split.select)
-            fits = dict(zip(names, rebuilt, strict=True))
+            fine, *fewer = self.steps.several("fit", jobs, self.settings.processes)
+            value = log_likelihood(fine, self.split.select)
             losses = {
-                name: compare(log_likelihood(fewer, self.split.select), value, self.block)
-                for name, fewer in fits.items()
+                name: compare(log_likelihood(other, self.split.select), value, self.block)
+                for name, other in zip(names, fewer, strict=True)
             }
-            needless = [n for n, loss in losses.items() if loss.nats < self.settings.errors * loss.error]
+            needless = [n for n, loss in losses.items() if loss.nats <= self.settings.sure * loss.error]
             if not needless:
-                return fit, losses
-            fit = fits[min(needless, key=lambda n: losses[n].nats)]
+                return fine, losses
+            least = min(needless, key=lambda n: losses[n].nats)
+            rest = Extension([e for e in copy_effects(fit.extension, []).effects if e.name != least])
+            fit = fewer[names.index(least)] if len(names) == 1 else self._go_on(fit.copy(rest, self.seed))
 
 
 def best_of_each(trials: list[Trial]) -> list[Trial]:
@@ -383,21 +394,28 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
 
 
 def finalists(trials: list[Trial], number: int) -> list[Trial]:
-    """With which terms the scene is built anew: those that gain most, and the one with the most evidence.
+    """With which terms the scene is built anew: those that gain most, and those with the most evidence.
 
     Args:
         trials: warm ones, the most evidence first.
         number: of those that gain most.
 
     Returns:
-        at most one more.
+        at most two more: the first, and the first effect that is the same law at all spots. Numbers of single
+        spots take up what is wrong there at once; a law has to drive the scene out first.
     """
-    most = sorted(trials, key=lambda t: -t.gain.nats)[:number]
-    return [t for t in trials if any(t is m for m in most) or t is trials[0]]
+    most = sorted(trials, key=lambda t: -t.gain.nats)[:number] + trials[:1]
+    most += [t for t in trials if is_law(t.candidate)][:1]
+    return [t for t in trials if any(t is m for m in most)]
+
+
+def is_law(candidate: Candidate | None) -> bool:
+    """A term that is an effect, and not one with a number for each spot."""
+    return candidate is not None and candidate.name not in FREE_NAMES and not candidate.effect.per_spot
 
 
 def leaders(wanted: list[Candidate], number: int) -> list[Candidate]:
-    """With which terms the scene is rebuilt: the best free one, and the best effects.
+    """Which terms are tried: the best free one, the best with a number for each spot, the best effects.
 
     Args:
         wanted: most evidence first; below ``HOPELESS`` of the best there are no leaders.
@@ -407,9 +425,10 @@ def leaders(wanted: list[Candidate], number: int) -> list[Candidate]:
         at most so many, most evidence first.
     """
     wanted = [c for c in wanted if c.evidence > HOPELESS * wanted[0].evidence]
-    free = [c for c in wanted if c.name in FREE_NAMES][:1]
-    named = [c for c in wanted if c.name not in FREE_NAMES][: number - len(free)]
-    return sorted(free + named, key=lambda c: -c.evidence)
+    laws = [c for c in wanted if is_law(c)]
+    others = [c for c in wanted if c.name in FREE_NAMES and not c.effect.per_spot][:1]
+    others += [c for c in wanted if c.effect.per_spot][:1]
+    return sorted(others + laws[: number - len(others)], key=lambda c: -c.evidence)
 
 
 def choose(trials: list[Trial], block: np.ndarray, errors: float) -> Trial:
@@ -433,8 +452,7 @@ def choose(trials: list[Trial], block: np.ndarray, errors: float) -> Trial:
 
     def cost(t: Trial) -> tuple[bool, int, float]:
         assert t.candidate is not None
-        number = 2 if t.candidate.effect.per_spot else len(t.candidate.step)
-        return t.name in FREE_NAMES, number, -t.gain.nats
+        return t.name in FREE_NAMES, len(t.candidate.step), -t.gain.nats
 
     return min((t for t in trials if t is best or near(t)), key=cost)
 
@@ -464,17 +482,19 @@ def criticise(
         base, turns and final fit.
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
-    fit, again, turns, grown = base, None, [], False
+    fit, turns, grown, fine_base = base, [], False, False
     while len(fit.extension.effects) < s.most:
         turns.append(loop.turn(fit, grown))
         taken = turns[-1].accepted
         if taken is None:
             break
+        fit = taken.fit
         if taken.candidate is None:
-            again, fit, grown = fit, taken.fit, True
+            grown = True
             if not fit.extension.effects:
-                base = fit
-        else:
-            again, fit = None, taken.fit
-    fit, losses = loop.drop_needless(fit)
-    return Findings(base, fit, turns, losses, again)
+                base, fine_base = fit, True
+    final, losses = loop.drop_needless(fit)
+    if fit.extension.effects and not fine_base:
+        refine = partial(loop.refined, base)
+        base = loop.steps("fit", "refining the scene without any effect", "fine_base", refine)
+    return Findings(base, final, turns, losses, fit if losses else None)

@@ -18,6 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from data_modules.readers import write_capture
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.free_terms import FREE
 
 SCENE = [
     "scene.simulate.scan.nx=24",
@@ -27,8 +28,7 @@ SCENE = [
 ]
 SMALL = [
     "surfels.contest=40", "surfels.rounds=2", "surfels.steps=40", "surfels.more=0",
-    "criticism.spots=96", "criticism.steps=10", "criticism.rivals=1",
-    "criticism.finalists=1", "criticism.far_off=9", "criticism.most=1", "threads=1",
+    "criticism.spots=96", "criticism.rivals=1", "criticism.finalists=1", "criticism.most=1", "threads=1",
 ]  # fmt: skip
 FIGURES = [
     "residual_time",
@@ -68,19 +68,23 @@ def finished(tmp_path_factory) -> Path:
 def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     said = json.loads((finished / "diagnosis" / "diagnosis.json").read_text())
     assert set(said) == {
-        "effects", "groups", "unexplained", "screened", "base", "extended", "untouched_test", "witness",
-        "profiles", "numerics", "notes", "capture", "toys", "seconds", "seed",
+        "effects", "unknown", "groups", "unexplained", "screened", "base", "extended", "untouched_test",
+        "witness", "profiles", "needed", "chance", "notes", "capture", "toys", "seconds", "seed",
     }  # fmt: skip
-    assert {s["name"] for s in said["screened"]} == {e.name for e in EFFECTS}
+    assert {s["name"] for s in said["screened"]} == {e.name for e in [*EFFECTS, *FREE]}
     for one in said["screened"]:
-        assert 0 <= one["p_value"] <= 1
-        assert one["statistic"] >= 0
         assert -1e-3 <= one["retained_information"] <= 1 + 1e-3
-    gains = [s["predicted_gain"] for s in said["screened"]]
-    assert gains == sorted(gains, reverse=True)
+        assert one["scatter"] >= 1
+    evidence = [s["evidence"] for s in said["screened"]]
+    assert evidence == sorted(evidence, reverse=True)
+    assert said["needed"] == pytest.approx(np.log(len(evidence) / 0.01))
+    assert said["chance"] == pytest.approx(min(1, len(evidence) * np.exp(-evidence[0])))
     assert said["effects"] == [], "nothing is hidden in the scene"
-    assert set(said["unexplained"]) == {"significant", "axis", "statistic", "p_value"}
-    assert said["base"] == said["extended"]
+    assert said["unknown"] == []
+    assert set(said["unexplained"]) == {"significant", "axis", "evidence"}
+    assert said["unexplained"]["significant"] is False
+    if evidence[0] < said["needed"]:
+        assert said["base"] == said["extended"]
     assert said["untouched_test"]["base"]["deviance_noise"] == pytest.approx(
         said["base"]["deviance_noise"], rel=0.05
     )
@@ -98,10 +102,7 @@ def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
         576,
         256,
     )
-    assert set(said["numerics"]) == {"another random seed", "finer quadrature of surfels"}
-    assert 0 < abs(said["numerics"]["another random seed"]) < 0.2
     page = (finished / "diagnosis" / "report.html").read_text()
-    assert "Nothing in the registry is needed" in page
     assert page.count("data:image/png;base64,") >= len(FIGURES)
     for name in FIGURES:
         assert (finished / "diagnosis" / "figures" / f"{name}.png").stat().st_size > 5000
@@ -143,11 +144,10 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
         folder=run,
     )
     trained = times(run)
-    command("diagnose", *SMALL, "criticism.numerics=false", f"run={run}", folder=tmp_path / "log")
+    command("diagnose", *SMALL, f"run={run}", folder=tmp_path / "log")
     said = json.loads((run / "diagnosis" / "diagnosis.json").read_text())
     assert said["capture"]["name"] == "two plates"
     assert said["capture"]["spots"] == 576
-    assert said["numerics"] == {}
     assert (run / "diagnosis" / "report.html").exists()
     assert list((run / "tensorboard").glob("events.out.tfevents.*"))
     assert {path: time for path, time in times(run).items() if path in trained} == trained

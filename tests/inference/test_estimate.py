@@ -243,7 +243,7 @@ def test_what_is_said_of_accepted_terms(findings):
     assert said.groups == [["irf_tail", "afterpulsing"]]
     assert (tail.evidence, tail.axis, tail.shape) == (500, "", None)
     assert tail.parameters["fraction"].value == pytest.approx(0.2)
-    found, measured, split, _ = findings
+    _, measured, split, _ = findings
     photons, bins = measured.gated_counts()[split.select].sum(), len(split.select) * 58
     gain = tail.heldout_gain
     assert gain.nats_per_photon == pytest.approx(250 / photons)

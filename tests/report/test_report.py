@@ -220,7 +220,10 @@ def test_the_verdict_on_something_without_a_name():
     at_noise = diagnosis(base=Scores(0.7, 0.71, 0, 0), untouched_test={}, unknown=[UNKNOWN["free_time"]])
     assert verdict(at_noise) == wrong
     several = [
-        *(UNKNOWN[name] for name in ("free_response_wall", "free_spot_gain", "free_response_scan", "free_wall")),
+        *(
+            UNKNOWN[name]
+            for name in ("free_response_wall", "free_spot_gain", "free_response_scan", "free_wall")
+        ),
         *(free("free_lines", "wall"), free("free_rate", "rate")),
     ]
     assert verdict(diagnosis(unknown=several)).startswith(
