@@ -50,7 +50,8 @@ class CriticismSettings:
         sure: standard errors that a term's absence must cost, beside a fine scene, for the term to be kept.
         rivals: terms with which the fit goes on in a turn. finalists: of them, with which the scene is
             rebuilt from new seeds, too; the one with the most evidence is always among them.
-        open_share: weight from which on a rival belongs to what the capture cannot tell from the best.
+        open_share: weight above which a rival is one that the capture leaves open: the simplest of these is
+            taken, the others are its group.
         most: terms that are accepted at most.
         toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
             side by side.
@@ -281,7 +282,7 @@ class Loop:
         )
         asked = best_of_each(tried)
         sure = [t for t in asked if self._beats(t, warm) and t.gain.nats > s.errors * t.gain.error]
-        best = choose(sure, self.block, s.errors) if sure else None
+        best = choose(weighed(sure, self.block), s.open_share) if sure else None
         if grown and best is None:
             return Turn(candidates, asked, grown=grown)
         other = partial(_rebuilt, self.rebuild, fit.extension, self.seed + 1, True)
@@ -431,30 +432,25 @@ def leaders(wanted: list[Candidate], number: int) -> list[Candidate]:
     return sorted(others + laws[: number - len(others)], key=lambda c: -c.evidence)
 
 
-def choose(trials: list[Trial], block: np.ndarray, errors: float) -> Trial:
-    """The trial that gains most, or a simpler one that falls short of it by few errors only.
+def choose(trials: list[Trial], least: float) -> Trial:
+    """The simplest of those that the wall patches leave open.
 
     An effect is simpler than a free term, and fewer coefficients are simpler than more.
 
     Args:
-        trials: with a candidate each.
-        block: ``[S]`` wall block of each select spot.
-        errors: how many.
+        trials: with a candidate and a weight each.
+        least: weight above which a trial is open.
 
     Returns:
-        one of them.
+        one of them; that of the largest weight where none is above.
     """
-    best = max(trials, key=lambda t: t.gain.nats)
-
-    def near(t: Trial) -> bool:
-        short = compare(t.likelihood, best.likelihood, block)
-        return short.nats <= errors * short.error
 
     def cost(t: Trial) -> tuple[bool, int, float]:
         assert t.candidate is not None
-        return t.name in FREE_NAMES, len(t.candidate.step), -t.gain.nats
+        return t.name in FREE_NAMES, len(t.candidate.step), -t.weight
 
-    return min((t for t in trials if t is best or near(t)), key=cost)
+    heaviest = max(trials, key=lambda t: t.weight)
+    return min((t for t in trials if t.weight > least or t is heaviest), key=cost)
 
 
 def criticise(
