@@ -14,8 +14,8 @@ from blind_truth import CASES, Spec
 from nlos_lit.inference.criticise import CriticismSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-# Fewer spots and rivals than a diagnosis takes.
-QUICK = CriticismSettings(spots=256, rivals=2, finalists=1, most=1)
+# Fewer spots and rebuilds than a diagnosis takes.
+QUICK = CriticismSettings(spots=256, finalists=1, most=1)
 WHOLE = CriticismSettings()
 HARD = {
     "retroreflection": "without cosines the counts do not tell normals; the base breaks (docs/criticism.md)",
