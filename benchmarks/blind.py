@@ -31,7 +31,7 @@ CLEAR = 100.0  # projected true statistic from which on a hidden effect ought to
 def work(set_name: str, index: int) -> dict:
     """Diagnose one capture and store the outcome."""
     import torch
-    from wild_judge import judge
+    from judge_wild import judge
 
     from nlos_lit.inference.criticise import CriticismSettings
 

@@ -331,7 +331,15 @@ class Loop:
         return trials
 
     def refined(self, fit: SurfelFit, without: str = "") -> SurfelFit:
-        """The scene gone on with without one of its terms, then as fine as the counts ask for."""
+        """The scene gone on with without one of its terms, then as fine as the counts ask for.
+
+        Args:
+            fit: with all terms.
+            without: name of the one; empty leaves all.
+
+        Returns:
+            another fit.
+        """
         return solve_spots(self.grow(self._without(fit, without) if without else fit, self.seed))
 
     def drop_needless(self, fit: SurfelFit) -> tuple[SurfelFit, dict[str, Comparison]]:
