@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
@@ -30,20 +28,6 @@ class Split:
     select: np.ndarray
     test: np.ndarray
     block: np.ndarray
-
-    def folds(self, spots: Tensor, number: int) -> Tensor:
-        """Fold of each spot: whole blocks, dealt so that neighbours differ.
-
-        Args:
-            spots: ``[B]`` rows of the capture.
-            number: of folds.
-
-        Returns:
-            ``[B]`` from 0 to ``number`` - 1.
-        """
-        names, index = np.unique(self.block[spots.numpy()], return_inverse=True)
-        order = np.random.default_rng(0).permutation(len(names)) % number
-        return torch.from_numpy(order[index])
 
 
 def split_spots(capture: Capture, blocks: int = 8) -> Split:
