@@ -80,9 +80,23 @@ class FreeTerm(Free):
     def values(self) -> Tensor:
         return self.functions @ self.value("field").reshape(-1)
 
+    def at(self, spots: Tensor) -> Tensor:
+        """``[B, 1]`` f at spots, where the functions are those of the spot."""
+        return (self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+
     def quantities(self) -> dict[str, Quantity]:
         p, field = self.declared["field"], self.values()
         return {"rms": Quantity(length(field / field.numel() ** 0.5, p.scale), p.unit, kind=p.kind)}
+
+
+class _FreeCounts(FreeTerm):
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.at(spots))
+
+
+class _FreeBackground(FreeTerm):
+    def background(self, background: Tensor, spots: Tensor) -> Tensor:
+        return background * torch.exp(self.at(spots))
 
 
 class FreeTime(FreeTerm):
@@ -99,7 +113,7 @@ class FreeTime(FreeTerm):
         return expected * torch.exp(self.values())
 
 
-class FreeWall(FreeTerm):
+class FreeWall(_FreeCounts):
     """``m → m e^{f(x, y)}``, f any combination of 8×8 splines over the wall."""
 
     name, axis = "free_wall", "wall"
@@ -109,11 +123,8 @@ class FreeWall(FreeTerm):
     def basis(cls, scan: Scan) -> Tensor:
         return over_wall(scan, 8)[0]
 
-    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
 
-
-class FreeLines(FreeTerm):
+class FreeLines(_FreeCounts):
     """``m → m e^{f(x) + g(y)}``, f and g constant within each of 24 stripes of the wall."""
 
     name, axis = "free_lines", "wall"
@@ -124,11 +135,8 @@ class FreeLines(FreeTerm):
         place = scan.places[-1]
         return torch.cat([bands((place[:, k] + 1) / 2, 24) for k in (0, 1)], 1)
 
-    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
 
-
-class FreeScan(FreeTerm):
+class FreeScan(_FreeCounts):
     """``m → m e^{f(u)}``, f constant within each of 64 stretches of the scan."""
 
     name, axis = "free_scan", "scan"
@@ -138,10 +146,7 @@ class FreeScan(FreeTerm):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return bands((scan.rank + 1) / 2, 64)
-
-    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        return expected * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+        return stretches(scan, 64)
 
 
 class FreeRate(FreeTerm):
@@ -165,7 +170,7 @@ class FreeRate(FreeTerm):
         return expected * torch.exp(tents @ self.value("field").reshape(-1))[:, None]
 
 
-class FreeScanBackground(FreeTerm):
+class FreeScanBackground(_FreeBackground):
     """``background → background e^{f(u)}``, f constant within each of 64 stretches of the scan."""
 
     name, axis = "free_scan_background", "scan"
@@ -175,13 +180,10 @@ class FreeScanBackground(FreeTerm):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return bands((scan.rank + 1) / 2, 64)
-
-    def background(self, background: Tensor, spots: Tensor) -> Tensor:
-        return background * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
+        return stretches(scan, 64)
 
 
-class FreeWallBackground(FreeTerm):
+class FreeWallBackground(_FreeBackground):
     """``background → background e^{f(x, y)}``, f any combination of 8×8 splines over the wall."""
 
     name, axis = "free_wall_background", "wall"
@@ -192,9 +194,6 @@ class FreeWallBackground(FreeTerm):
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
         return over_wall(scan, 8)[0]
-
-    def background(self, background: Tensor, spots: Tensor) -> Tensor:
-        return background * torch.exp(self.functions[spots] @ self.value("field").reshape(-1))[:, None]
 
 
 class _FreeDelay(FreeTerm):
@@ -210,7 +209,7 @@ class _FreeDelay(FreeTerm):
         return TimingJitter(self.scan)
 
     def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
-        return length + (self.functions[spots] @ self.value("field").reshape(-1))[:, None, None]
+        return length + self.at(spots)[:, None]
 
 
 class FreeScanDelay(_FreeDelay):
@@ -223,7 +222,7 @@ class FreeScanDelay(_FreeDelay):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return bands((scan.rank + 1) / 2, 24)
+        return stretches(scan, 24)
 
 
 class FreeWallDelay(_FreeDelay):
@@ -295,7 +294,7 @@ class FreeResponseScan(_FreeResponse):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return bands((scan.rank + 1) / 2, 16)
+        return stretches(scan, 16)
 
 
 class FreeResponseWall(_FreeResponse):
@@ -355,6 +354,19 @@ def bands(place: Tensor, number: int) -> Tensor:
     """
     index = (place * number).long().clamp(0, number - 1)
     return torch.nn.functional.one_hot(index, number).float()
+
+
+def stretches(scan: Scan, number: int) -> Tensor:
+    """``[S, number]`` indicators of equal bands of the order of acquisition.
+
+    Args:
+        scan: of the capture.
+        number: of bands.
+
+    Returns:
+        one in the band of each spot, else zero.
+    """
+    return bands((scan.rank + 1) / 2, number)
 
 
 def response_changes(n_bins: int) -> Tensor:

@@ -266,11 +266,12 @@ class Loop:
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         for c in rivals:
             jobs.append((f"going on with {c.name}", c, partial(self._warm, fit, [c])))
-        warm, *tried = self._trials(fit, jobs)
+        before = log_likelihood(fit, self.split.select)
+        warm, *tried = self._trials(before, jobs)
         last = [] if grown else finalists(tried, s.finalists)
         self.steps.plan(fit=len(last) + 1)
         tried += self._trials(
-            fit,
+            before,
             [
                 (
                     f"rebuilding the scene with {t.name}",
@@ -289,7 +290,7 @@ class Loop:
         more: Job = ("rebuilding the scene by other seeds", None, other)
         if not grown:
             more = ("refining the scene", None, partial(self.grow, fit, self.seed + 1))
-        controls = self._trials(fit, [more])
+        controls = self._trials(before, [more])
         trials = weighed([*asked, *controls], self.block)
         if best is not None and not any(self._beats(control, best) for control in controls):
             best = next(t for t in trials if t.candidate is best.candidate)
@@ -319,10 +320,9 @@ class Loop:
         gain = compare(other.likelihood, one.likelihood, self.block)
         return gain.nats > self.settings.errors * gain.error
 
-    def _trials(self, fit: SurfelFit, jobs: list[Job]) -> list[Trial]:
+    def _trials(self, before: Tensor, jobs: list[Job]) -> list[Trial]:
         named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]
         fits = self.steps.several("fit", named, self.settings.processes)
-        before = log_likelihood(fit, self.split.select)
         trials = []
         for (_, c, _), again in zip(jobs, fits, strict=True):
             if again is not None:
@@ -375,8 +375,7 @@ class Loop:
             if not needless:
                 return fine, losses
             least = min(needless, key=lambda n: losses[n].nats)
-            rest = Extension([e for e in copy_effects(fit.extension, []).effects if e.name != least])
-            fit = fewer[names.index(least)] if len(names) == 1 else self._go_on(fit.copy(rest, self.seed))
+            fit = fewer[0] if len(names) == 1 else self._without(fit, least)
 
 
 def best_of_each(trials: list[Trial]) -> list[Trial]:

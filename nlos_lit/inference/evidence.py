@@ -83,7 +83,7 @@ class Evidence:
     """What one term at one shape is worth.
 
     Args:
-        nats: log Bayes factor against no such term; -inf is never reached, τ = 0 gives 0.
+        nats: log Bayes factor against no such term; at least 0, which τ = 0 gives.
         scale: τ.
         step: ``[k]`` posterior mean of the stored amplitudes' change.
         error: ``[k]`` its standard deviation by counts alone.

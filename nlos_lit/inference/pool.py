@@ -166,13 +166,28 @@ def _evidence(
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:
     """The best shape; the evidence is the mean of the Bayes factors of all that could have been."""
     shape, best = max(tried, key=lambda entry: entry[1].nats)
-    number = len(effect.shape_grid())
-    nats = torch.tensor([e.nats for _, e in tried], dtype=torch.float64)
-    mean = float(torch.logsumexp(nats, 0)) - math.log(number)
+    mean = mean_factor([e.nats for _, e in tried], len(effect.shape_grid()))
     effect.set_all(shape)
     if bool(effect.precision().any()) and best.scale:
         effect.prior_scale = best.scale
     return Candidate(effect, mean, best.retained, best.scatter, shape, best.step, best.error)
+
+
+def mean_factor(nats: list[float], number: int) -> float:
+    """Logarithm of the mean of Bayes factors.
+
+    Args:
+        nats: their logarithms; the others are nothing beside them.
+        number: of all.
+
+    Returns:
+        nats.
+
+    Examples:
+        >>> round(mean_factor([10.0, 10.0], 4), 2)
+        9.31
+    """
+    return float(torch.logsumexp(torch.tensor(nats, dtype=torch.float64), 0)) - math.log(number)
 
 
 def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
@@ -235,5 +250,4 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     full[problem.spots] = coefficients(score, information, effect.width, sparse(effect)).float()
     error = torch.full_like(full, float("nan"))
     error[problem.spots] = information.rsqrt().float()
-    mean = float(torch.logsumexp(torch.tensor(nats, dtype=torch.float64), 0)) - math.log(len(shapes))
-    return Candidate(effect, mean, 1.0, 1.0, shape, full, error)
+    return Candidate(effect, mean_factor(nats, len(shapes)), 1.0, 1.0, shape, full, error)

@@ -11,19 +11,14 @@ import traceback
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from blind_judge import pipeline_for
 from wild_statistic import true_statistics
 from wild_truth import make
 
 from data_modules.readers import read_capture
-from nlos_lit.capture import Capture
-from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.result import Diagnosis
-from nlos_lit.model.build import PipelineSettings
-from nlos_lit.surfels.fit import SurfelSettings
-
-SURFELS = SurfelSettings(most=2400)  # conf/surfels/diagnosis.yaml
 
 
 @dataclass(frozen=True)
@@ -56,13 +51,6 @@ class Outcome:
     largest: tuple[str, float] = ("", 0.0)
     seconds: float = 0.0
     error: str = ""
-
-
-def pipeline_for(capture: Capture) -> BasePipeline:
-    """Settings that follow from the capture's time window alone."""
-    near, far = (length / 2 for length in capture.path_gate)
-    model = PipelineSettings(0.1, wavelength_range=(2 / 3, 2.0))
-    return BasePipeline({"depth": (max(0.15, near - 0.3), far)}, model, SURFELS, 2 << 30)
 
 
 def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
