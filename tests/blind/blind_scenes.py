@@ -17,10 +17,11 @@ from blind_elements import Axis, Elements, Legs, cut, fourth_bounce, sight, thir
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter
 
-from data_modules.readers import read_capture
+from data_modules.readers import read_capture, write_capture
 from data_modules.simulate import SCENES as MESHES
 from data_modules.simulate import Mesh, join, wall_grid
 from data_modules.simulate.scenes import plate
+from nlos_lit.capture import Capture
 
 RENDERS = Path(__file__).resolve().parents[3] / "shared" / "data" / "rendered"
 SIDE = 32  # spots along x and y
@@ -196,3 +197,33 @@ def finer(light: np.ndarray, t_start: float, bin_length: float, axis: Axis) -> n
     total = np.concatenate([np.zeros((len(light), 1)), np.cumsum(light, axis=1, dtype=np.float64)], axis=1)
     at = PchipInterpolator(edges, total, axis=1)(np.clip(axis.edges, edges[0], edges[-1]))
     return np.maximum(np.diff(at, axis=1), 0)
+
+
+def scan_order(name: str, side: int) -> np.ndarray:
+    """``[S]`` rank of each spot ``i·side + j``."""
+    rank = np.arange(side**2).reshape(side, side)
+    if name == "serpentine":
+        rank[1::2] = rank[1::2, ::-1].copy()
+    elif name == "columns":
+        rank = rank.T.copy()
+    elif name != "raster":
+        raise ValueError(f"scan order {name!r} is none of raster, serpentine and columns")
+    return rank.ravel()
+
+
+def write_scan(path: str | Path, scene: Scene, counts: np.ndarray, order: np.ndarray) -> None:
+    """A y-tal file (replaced if it exists) of photons ``[S, T]``, which tells nothing of what is in it."""
+    normals, side = np.broadcast_to([0.0, 0.0, 1.0], scene.laser.shape), round(len(order) ** 0.5)
+    capture = Capture(
+        counts=counts.astype(np.uint32),
+        laser=scene.laser,
+        sensor=scene.sensor,
+        laser_normal=normals,
+        sensor_normal=normals,
+        bin_length=scene.window.bin_length,
+        t_start=scene.window.t_start,
+        scan_shape=(side, side),
+        scan_order=order,
+        provenance={"source": "blind test", "steps": []},
+    )
+    write_capture(path, capture, overwrite=True)

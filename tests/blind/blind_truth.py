@@ -14,11 +14,8 @@ from pathlib import Path
 
 import numpy as np
 from blind_inject import EFFECTS, ORDER, UNKNOWN
-from blind_scenes import SIDE, available, load
+from blind_scenes import SIDE, available, load, scan_order, write_scan
 from blind_work import Work
-
-from data_modules.readers import write_capture
-from nlos_lit.capture import Capture
 
 LEVELS = (500, 1500, 5000, 10000)
 STRENGTHS = ("just detectable", "weak", "strong", "gross")
@@ -87,27 +84,14 @@ def make_capture(spec: Spec, path: str | Path) -> Truth:
     truth = hide(spec)
     scene = load(spec.scene)
     counts = np.random.default_rng([spec.seed, 1]).poisson(truth.expected)
-    normals = np.broadcast_to([0.0, 0.0, 1.0], scene.laser.shape)
-    capture = Capture(
-        counts=counts.astype(np.uint32),
-        laser=scene.laser,
-        sensor=scene.sensor,
-        laser_normal=normals,
-        sensor_normal=normals,
-        bin_length=scene.window.bin_length,
-        t_start=scene.window.t_start,
-        scan_shape=(SIDE, SIDE),
-        scan_order=_order(spec.order),
-        provenance={"source": "blind test", "steps": []},
-    )
-    write_capture(path, capture, overwrite=True)
+    write_scan(path, scene, counts, scan_order(spec.order, SIDE))
     return truth
 
 
 def hide(spec: Spec) -> Truth:
     """The truth without a file."""
     scene = load(spec.scene)
-    rank = 2 * _order(spec.order) / (SIDE**2 - 1) - 1
+    rank = 2 * scan_order(spec.order, SIDE) / (SIDE**2 - 1) - 1
     work = Work(scene, spec.level, rank, np.random.default_rng(0))
     without = work.expected()
     values, labels = {}, {}
@@ -197,16 +181,6 @@ _RENDERED = {
 def compatible(names: tuple[str, ...]) -> bool:
     """At most one of the effects renders the scene anew."""
     return len(_RENDERED.intersection(names)) < 2
-
-
-def _order(name: str) -> np.ndarray:
-    """``[S]`` rank of each spot."""
-    rank = np.arange(SIDE**2).reshape(SIDE, SIDE)
-    if name == "serpentine":
-        rank[1::2] = rank[1::2, ::-1].copy()
-    elif name != "raster":
-        raise ValueError(f"scan order {name!r} is neither raster nor serpentine")
-    return rank.ravel()
 
 
 def _case(

@@ -12,13 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from blind_scenes import scan_order, write_scan
 from wild_scenes import WildScene, load
 from wild_table import ALL, STRENGTHS, Spec, spec_of
 from wild_unknown import UNKNOWN
 from wild_work import WildWork
-
-from data_modules.readers import write_capture
-from nlos_lit.capture import Capture
 
 
 @dataclass(frozen=True)
@@ -64,21 +62,7 @@ def make(set_name: str, index: int, path: str | Path | None = None) -> Truth:
 
 def write(truth: Truth, path: str | Path) -> None:
     """The capture as a y-tal file that tells nothing of what is in it."""
-    scene, side = truth.scene, truth.spec.side
-    normals = np.broadcast_to([0.0, 0.0, 1.0], scene.laser.shape)
-    capture = Capture(
-        counts=truth.counts.astype(np.uint32),
-        laser=scene.laser,
-        sensor=scene.sensor,
-        laser_normal=normals,
-        sensor_normal=normals,
-        bin_length=scene.window.bin_length,
-        t_start=scene.window.t_start,
-        scan_shape=(side, side),
-        scan_order=scan_order(truth.spec.order, side),
-        provenance={"source": "blind test", "steps": []},
-    )
-    write_capture(path, capture, overwrite=True)
+    write_scan(path, truth.scene, truth.counts, scan_order(truth.spec.order, truth.spec.side))
 
 
 def hide(spec: Spec) -> Truth:
@@ -135,15 +119,3 @@ def _measured(spec: Spec, names: tuple[str, ...]) -> tuple[WildWork, dict[str, d
         work.rng = np.random.default_rng([spec.seed, zlib.crc32(name.encode())])
         values[name] = ALL[name].inject(work, strength)
     return work, values
-
-
-def scan_order(name: str, side: int) -> np.ndarray:
-    """``[S]`` rank of each spot ``i·side + j``."""
-    rank = np.arange(side**2).reshape(side, side)
-    if name == "serpentine":
-        rank[1::2] = rank[1::2, ::-1].copy()
-    elif name == "columns":
-        rank = rank.T.copy()
-    elif name != "raster":
-        raise ValueError(f"scan order {name!r} is none of raster, serpentine and columns")
-    return rank.ravel()
