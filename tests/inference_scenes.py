@@ -170,10 +170,10 @@ def fit_of(
 
 
 def candidate(name: str, evidence: float = 100.0) -> Candidate:
-    """What the pool might have found, on a capture of twelve spots."""
+    """What the pool might have found, on a capture of twelve spots; nothing scatters."""
     effect = effect_of(name, Scan.of(capture_of(scattered(12))))
     size = sum(p.size for p in effect.amplitudes)
-    return Candidate(effect, evidence, 0.5, 1.0, {}, torch.zeros(size), torch.ones(size))
+    return Candidate(effect, evidence, 0.5, 1.0, {}, torch.zeros(size), torch.ones(size), evidence)
 
 
 def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:

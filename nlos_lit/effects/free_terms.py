@@ -254,7 +254,8 @@ class _FreeResponse(FreeTerm):
         return (1 + len(TAILS)) * cls.basis(scan).shape[1]
 
     def factors(self, spots: Tensor) -> Tensor | None:
-        return self.functions[spots]
+        """At the null only: changes of a changed response do not add up."""
+        return None if bool(self.value("field").any()) else self.functions[spots]
 
     def alone(self) -> Effect:
         return _EqualResponse(self.scan)

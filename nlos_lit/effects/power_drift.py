@@ -19,7 +19,7 @@ class PowerDrift(SmoothEffect):
     ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions
     without its constant.
 
-    Parameters: ``drift`` (1, logarithm of the gain), 5 coefficients, null 0. Quantities ``rms`` and
+    Parameters: ``drift`` (1, logarithm of the gain), 23 coefficients, null 0. Quantities ``rms`` and
     ``peak_to_peak`` (1).
 
     Signature: spot totals follow the order of acquisition; the shape in time is right.
@@ -43,6 +43,7 @@ class PowerDrift(SmoothEffect):
     }
     witness = "energy"
     coefficients = "drift"
+    falling: ClassVar[float] = 1.0
     ends: ClassVar[bool] = True
 
     @classmethod

@@ -21,15 +21,17 @@ class SmoothEffect(Effect):
     square 1 over the scan.
 
     The rougher a b_k, the smaller its coefficient is taken to be (prior): deviation ``likely`` of the
-    smoothest, falling with the third power of the frequency (Sobolev smoothness 2 over a plane). Without it,
-    coefficients that the fitted spots hardly settle run wild on those that were not fitted.
+    smoothest, falling with a power of the frequency. Without it, coefficients that the fitted spots hardly
+    settle run wild on those that were not fitted.
 
     Attributes:
         coefficients: name of the parameter.
+        falling: the power; 3 is Sobolev smoothness 2 over a plane, 1 a random walk along a line.
         ends: whether the peak-to-peak value is reported, too.
     """
 
     coefficients: ClassVar[str]
+    falling: ClassVar[float] = 3.0
     ends: ClassVar[bool] = False
     functions: Tensor
 
@@ -58,7 +60,7 @@ class SmoothEffect(Effect):
             The one parameter.
         """
         share = cls.basis(scan)[1]
-        prior = tuple((likely * share**1.5).tolist())
+        prior = tuple((likely * share ** (cls.falling / 2)).tolist())
         return (
             Parameter(
                 cls.coefficients, unit, 0.0, scale, -bound, bound, size=len(share), prior=prior, kind=kind
@@ -101,8 +103,8 @@ class SmoothEffect(Effect):
 
 
 def over_time(scan: Scan) -> tuple[Tensor, Tensor]:
-    """``[S, ≤ 5]`` smooth functions of the order of acquisition, and their shares ``[≤ 5]``."""
-    return smooth_basis(scan.rank, 6)
+    """``[S, ≤ 23]`` smooth functions of the order of acquisition, and their shares ``[≤ 23]``."""
+    return smooth_basis(scan.rank, 24)
 
 
 def over_wall(scan: Scan, n: int) -> tuple[Tensor, Tensor]:

@@ -18,10 +18,10 @@ from nlos_lit.functional.surfel_paths import Paths
 class TimeDrift(SmoothEffect):
     """The delay between laser and detector drifts, as with temperature.
 
-    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions without its
-    constant.
+    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 24 functions without its
+    constant, likely a random walk: its coefficients fall with the frequency.
 
-    Parameters: ``drift`` (m of path), 5 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (m).
+    Parameters: ``drift`` (m of path), 23 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (m).
 
     Signature: residuals of both signs at every edge in time, their sign changing along the scan.
 
@@ -43,6 +43,7 @@ class TimeDrift(SmoothEffect):
         "time_offset": "a second scan in another order",
     }
     coefficients = "drift"
+    falling: ClassVar[float] = 1.0
     ends: ClassVar[bool] = True
 
     @classmethod

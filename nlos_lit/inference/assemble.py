@@ -13,7 +13,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import RATES, Free
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn, needed
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn
 from nlos_lit.inference.heldout import Comparison, score
 from nlos_lit.inference.pool import Candidate, tested_rows
 from nlos_lit.inference.residuals import SIDE, profiles
@@ -74,14 +74,16 @@ def assemble(
         unknown=unknown,
         groups=[[a.name, *a.confusable_with] for a in named if a.confusable_with],
         unexplained=Unexplained(worst is not None, *most),
-        screened=[_screened(c, needed(first, settings)) for c in first],
+        screened=[_screened(c, found.turns[0].needed) for c in first],
         base=score(base, split.select),
         extended=score(final, split.select),
         untouched_test={"base": score(base, test), "extended": score(final, test)},
         witness=witness(capture, final),
         profiles=profiles(base, final, scan, fitted),
-        needed=needed(first, settings),
-        chance=min(1.0, len(first) * math.exp(-largest)) if null is None else null.chance(largest),
+        needed=found.turns[0].needed,
+        chance=math.exp(min(0.0, math.log(settings.level) + found.turns[0].needed - largest))
+        if null is None
+        else null.chance(largest),
         notes=[],
         capture=_facts(capture, name),
         toys=0 if null is None else null.toys,
@@ -91,33 +93,28 @@ def assemble(
 
 
 def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Split, scan: Scan) -> Accepted:
-    trial = turn.accepted
+    trial, confirmed = turn.best, turn.confirmed
     assert trial is not None  # what makes a turn one of these
-    assert trial.candidate is not None
+    assert confirmed is not None
     effect = next(e for e in found.final.extension.effects if e.name == trial.name)
     others = () if found.again is None else found.again.extension.effects
     again = next((e for e in others if e.name == effect.name), None)
-    kept = {_name(t) for t in found.accepted}
+    kept = {e.name for e in found.final.extension.effects}
     weights = {
         t.name: t.weight for t in turn.trials if t is trial or (t.name in turn.group and t.name not in kept)
     }
     total = sum(weights.values())
     free = effect if isinstance(effect, Free) else None
-    loss = found.losses.get(trial.name, trial.gain)
     return Accepted(
         name=effect.name,
         parameters=uncertainty.parameters(effect, again),
-        evidence=trial.candidate.evidence,
-        heldout_gain=_gain(found.final, loss, split),
+        evidence=confirmed.evidence,
+        heldout_gain=_gain(found.final, found.losses[trial.name], split),
         weights={name: weight / total for name, weight in weights.items()},
         split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
     )
-
-
-def _name(turn: Turn) -> str:
-    return "" if turn.accepted is None else turn.accepted.name
 
 
 def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:

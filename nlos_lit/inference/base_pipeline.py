@@ -55,9 +55,10 @@ class BasePipeline:
         image: tuple[Tensor, VolumeGrid],
         extension: Extension,
         seed: int,
-        fine: bool = True,
     ) -> SurfelFit:
         """Surfels from new seeds, with the given effects.
+
+        The scene stays as parsimonious as its seeds, and what it lacks is seen in the residual.
 
         Args:
             capture: raw counts.
@@ -65,15 +66,11 @@ class BasePipeline:
             image: ``[nz, nx, ny]`` and its grid, from :meth:`image`.
             extension: effects, fitted along in place.
             seed: of batches and tested spots.
-            fine: rounds follow and surfels are divided as long as the counts ask for it; else the scene stays
-                as parsimonious as its seeds, and what it lacks is seen in the residual.
 
         Returns:
             the fit, converged.
         """
-        settings = self.surfels
-        if not fine:
-            settings = replace(settings, rounds=min(COARSE, settings.rounds), more=0)
+        settings = replace(self.surfels, rounds=min(COARSE, self.surfels.rounds), more=0)
         given = (capture, *image, settings, split.fit)
         return fit_surfels(*given, extension=extension, seed=seed).fit
 
@@ -96,4 +93,4 @@ class BasePipeline:
 
     def __call__(self, capture: Capture, split: Split, seed: int) -> SurfelFit:
         """Image and parsimonious fit without effects."""
-        return self.fit(capture, split, self.image(capture), Extension([]), seed, fine=False)
+        return self.fit(capture, split, self.image(capture), Extension([]), seed)

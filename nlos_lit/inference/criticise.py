@@ -1,7 +1,9 @@
 """Show, name, extend, measure: the loop that finds out what a capture asks for (docs/criticism.md).
 
-A turn asks the pool, rebuilds the scene with its leaders, and decides on spots that were not fitted. More
-scene stands in the same contest: the same model with finer and more surfels. What gains most is taken.
+A turn asks the pool beside a parsimonious scene, lets the fit go on with the leaders, and takes the simplest
+of those that may be the best by spots that were not fitted; none at all is the simplest. It is kept if it is
+still asked for once the scene is as fine as the counts ask for, and if that scene predicts better than one
+that grew without it.
 """
 
 from __future__ import annotations
@@ -22,20 +24,19 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE_NAMES
-from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, weights
+from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, ask
+from nlos_lit.inference.pool import Candidate, ask, own_evidence, tested_rows
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
 from nlos_lit.surfels.fit import SurfelFit
 
 log = logging.getLogger(__name__)
-Rebuild = Callable[[Extension, int, bool], SurfelFit]
+Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 120  # batches, and as many again at falling rate
-HOPELESS = 0.05  # of the best evidence: a rebuild does not turn such odds
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,15 @@ class CriticismSettings:
 
     Args:
         spots: fitted spots that the pool is asked on at most.
-        level: chance of a false name that is borne: a term needs ln(terms in the pool/level) nats of
-            evidence.
-        errors: standard errors by which predictions of other spots must differ to count as different.
-        sure: standard errors that a term's absence must cost, beside a fine scene, for the term to be kept.
-        rivals: terms with which the fit goes on in a turn. finalists: of them, with which the scene is
-            rebuilt from new seeds, too; the one with the most evidence is always among them.
+        level: chance of a false name that is borne where the base is right: a term needs ln(terms in the
+            pool/level) nats of evidence.
+        share: of the misfit that a fine scene leaves, nats; a term needs so much on top. What is wrong for
+            unknown reasons may look a little like anything.
+        rivals: effects with which the fit goes on in a turn, besides the best free term and the best with a
+            number for each spot.
         open_share: weight above which a rival is one that the capture leaves open: the simplest of these is
-            taken, the others are its group.
+            taken, the others are its group. A fine scene without the term must not be open.
+        most_of: share of the best gain from which on an effect goes before a free term.
         most: terms that are accepted at most.
         toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
             side by side.
@@ -59,11 +61,10 @@ class CriticismSettings:
 
     spots: int = 1024
     level: float = 0.01
-    errors: float = 2.0
-    sure: float = 3.0
-    rivals: int = 4
-    finalists: int = 2
+    share: float = 0.15
+    rivals: int = 6
     open_share: float = 0.05
+    most_of: float = 0.9
     most: int = 5
     toys: int = 0
     processes: int = 2
@@ -71,13 +72,13 @@ class CriticismSettings:
 
 @dataclass(frozen=True)
 class Trial:
-    """The scene rebuilt with one more term, or with none but finer.
+    """A fit gone on with one more term, or with none.
 
     Args:
-        candidate: the term; None for more scene.
-        fit: the rebuilt scene.
+        candidate: the term; None for none.
+        fit: the scene with it.
         likelihood: ``[S]`` of the select spots, nats.
-        gain: over the fit that the turn began with.
+        gain: over going on with none.
         weight: how far the capture leaves open that this is the best of its turn.
     """
 
@@ -89,10 +90,27 @@ class Trial:
 
     @property
     def name(self) -> str:
-        return "more scene" if self.candidate is None else self.candidate.name
+        return "none" if self.candidate is None else self.candidate.name
 
 
-Job = tuple[str, Candidate | None, Callable[[], SurfelFit | None]]  # what is said, term, what makes the fit
+Job = tuple[str, Candidate | None, Callable[[], SurfelFit]]  # what is said, term, what makes the fit
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """What is left of a term once the scene is fine.
+
+    Args:
+        evidence: nats, of the term beside all else.
+        needed: nats.
+        gain: of the select spots over the scene that grew without it.
+        weight: how far the capture leaves open that it predicts better than that one.
+    """
+
+    evidence: float
+    needed: float
+    gain: Comparison
+    weight: float
 
 
 @dataclass(frozen=True)
@@ -101,16 +119,22 @@ class Turn:
 
     Args:
         candidates: the pool, most evidence first.
-        trials: rebuilt scenes, the largest gain first.
-        accepted: one of them; None ends the loop.
-        group: names that the capture cannot tell from the accepted one.
+        needed: nats.
+        trials: fits gone on with its leaders and with none, the largest gain first.
+        best: the simplest of those that are open.
+        group: names that the capture cannot tell from it; a free term is none for an effect.
+        confirmed: what a fine scene left of it; None where there was none.
+        accepted: it is in the model from here on.
         grown: the base was fine already.
     """
 
     candidates: list[Candidate]
+    needed: float
     trials: list[Trial] = field(default_factory=list)
-    accepted: Trial | None = None
+    best: Trial | None = None
     group: list[str] = field(default_factory=list)
+    confirmed: Confirmed | None = None
+    accepted: bool = False
     grown: bool = False
 
 
@@ -119,10 +143,10 @@ class Findings:
     """What the loop leaves behind.
 
     Args:
-        base: the fit without effects, as fine as the final one.
-        final: the fit with all terms that were kept.
+        base: the fine fit without effects.
+        final: the fine fit with all terms that were kept.
         turns: of the loop.
-        losses: what each kept term's absence costs on the select spots, beside a fine scene.
+        losses: what each kept term's absence costs on the select spots, beside the final scene.
         again: the fit with these terms before the scene was refined; None where there is none.
     """
 
@@ -136,20 +160,35 @@ class Findings:
     def accepted(self) -> list[Turn]:
         """Turns whose term was kept."""
         kept = {e.name for e in self.final.extension.effects}
-        return [t for t in self.turns if t.accepted is not None and t.accepted.name in kept]
+        return [t for t in self.turns if t.accepted and t.best is not None and t.best.name in kept]
 
 
-def needed(candidates: list[Candidate], s: CriticismSettings) -> float:
+def needed(candidates: list[Candidate], s: CriticismSettings, misfit: float) -> float:
     """Nats that a term of this pool needs.
 
     Args:
         candidates: the pool.
         s: settings.
+        misfit: nats, see :func:`misfit_of`.
 
     Returns:
-        ln(terms/level).
+        ln(terms/level) and the settings' share of the misfit.
     """
-    return math.log(len(candidates) / s.level)
+    return math.log(len(candidates) / s.level) + s.share * misfit
+
+
+def misfit_of(fit: SurfelFit, spots: np.ndarray) -> float:
+    """How much likelier than by the fit the counts would be if all but counting noise were explained.
+
+    Args:
+        fit: that is judged.
+        spots: ``[S]`` rows of the capture that it was fitted to.
+
+    Returns:
+        nats, half the deviance above the noise's; 0 where there is none.
+    """
+    found = score(fit, spots)
+    return max(0.0, 0.5 * (found.deviance_per_bin - found.deviance_noise) * len(spots) * fit.counts.shape[1])
 
 
 def begun_with(fit: SurfelFit, extra: list[Candidate]) -> Extension:
@@ -196,10 +235,10 @@ def copy_effects(extension: Extension, extra: list[Effect]) -> Extension:
     return Extension(sorted((copy.deepcopy(e) for e in [*extension.effects, *extra]), key=acting_order))
 
 
-def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int, fine: bool) -> SurfelFit | None:
+def _rebuilt(rebuild: Rebuild, extension: Extension, seed: int) -> SurfelFit | None:
     """None: with these effects no surfel survives, so that they are not the ones."""
     try:
-        fit = rebuild(copy_effects(extension, []), seed, fine)
+        fit = rebuild(copy_effects(extension, []), seed)
     except UserError as error:
         log.info("a rebuild leaves nothing: %s", error)
         return None
@@ -218,8 +257,8 @@ class Loop:
     """All turns of one capture.
 
     Args:
-        rebuild: a fit from new seeds with given effects, begun at their present values, random seed, and
-            whether surfels may be divided as finely as the counts ask for.
+        rebuild: a parsimonious fit from new seeds with given effects, begun at their present values, and
+            random seed.
         grow: the same scene gone on with until surfels are as many and as fine as the counts ask for.
         split: of the spots.
         scan: of the capture.
@@ -243,62 +282,86 @@ class Loop:
         self.seed, self.steps, self.number = seed, steps, 0
         self.block = split.block[split.select]
 
-    def turn(self, fit: SurfelFit, grown: bool) -> Turn:
-        """Ask the pool, rebuild the scene with its leaders and finer, choose.
+    def turn(self, fit: SurfelFit, fine: SurfelFit) -> Turn:
+        """Ask the pool, go on with its leaders, choose.
 
         Args:
             fit: with the terms accepted so far.
-            grown: it is as fine as it gets.
+            fine: the fine scene with these terms, perhaps the same.
 
         Returns:
-            the turn; its ``accepted`` is None where nothing is asked for.
+            the turn, not confirmed yet; its ``best`` is None where nothing is asked for.
         """
-        s, self.number = self.settings, self.number + 1
-        self.steps.plan(screen=1, fit=s.rivals + s.finalists + 2)
+        s, grown, self.number = self.settings, fit is fine, self.number + 1
+        self.steps.plan(screen=1, fit=s.rivals + 5)
         asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed)
         candidates = self.steps(
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
-        wanted = [c for c in candidates if c.evidence > needed(candidates, s)]
-        rivals = leaders(wanted, s.rivals)
+        bar = needed(candidates, s, self._misfit(fine))
+        rivals = leaders(candidates, bar, s.rivals)
         if not rivals:
-            return Turn(candidates, grown=grown)
+            return Turn(candidates, bar, grown=grown)
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
-        for c in rivals:
-            jobs.append((f"going on with {c.name}", c, partial(self._warm, fit, [c])))
-        before = log_likelihood(fit, self.split.select)
-        warm, *tried = self._trials(before, jobs)
-        last = [] if grown else finalists(tried, s.finalists)
-        self.steps.plan(fit=len(last) + 1)
-        tried += self._trials(
-            before,
-            [
-                (
-                    f"rebuilding the scene with {t.name}",
-                    t.candidate,
-                    partial(_rebuilt, self.rebuild, t.fit.extension, self.seed, False),
-                )
-                for t in last
-            ],
-        )
-        asked = best_of_each(tried)
-        sure = [t for t in asked if self._beats(t, warm) and t.gain.nats > s.errors * t.gain.error]
-        best = choose(weighed(sure, self.block), s.open_share) if sure else None
-        if grown and best is None:
-            return Turn(candidates, asked, grown=grown)
-        other = partial(_rebuilt, self.rebuild, fit.extension, self.seed + 1, True)
-        more: Job = ("rebuilding the scene by other seeds", None, other)
-        if not grown:
-            more = ("refining the scene", None, partial(self.grow, fit, self.seed + 1))
-        controls = self._trials(before, [more])
-        trials = weighed([*asked, *controls], self.block)
-        if best is not None and not any(self._beats(control, best) for control in controls):
-            best = next(t for t in trials if t.candidate is best.candidate)
-            group = [t.name for t in trials if t.candidate and t is not best and t.weight > s.open_share]
-            return Turn(candidates, trials, best, group, grown)
-        if not grown and controls and controls[0].gain.nats > 0:
-            return Turn(candidates, trials, controls[0], grown=grown)
-        return Turn(candidates, trials, grown=grown)
+        jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
+        trials = weighed(self._trials(jobs), self.block)
+        left = left_open(trials, s.open_share, s.most_of)
+        best = min(left, key=cost)
+        if best.candidate is None:
+            return Turn(candidates, bar, trials, grown=grown)
+        group = [
+            t.name for t in left if t is not best and (t.name in FREE_NAMES) == (best.name in FREE_NAMES)
+        ]
+        return Turn(candidates, bar, trials, best, group, grown=grown)
+
+    def confirm(self, turn: Turn, fine: SurfelFit, without: SurfelFit) -> Turn:
+        """Is the turn's best term still asked for beside a fine scene?
+
+        Args:
+            turn: with a best term.
+            fine: the fine scene with it.
+            without: the fine scene that grew without it.
+
+        Returns:
+            the turn, accepted or not.
+        """
+        assert turn.best is not None
+        s, name = self.settings, turn.best.name
+        own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
+        nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}", own)
+        before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
+        bar = needed(turn.candidates, s, self._misfit(fine))
+        weight = weights([before, after], self.block)[1]
+        found = Confirmed(nats, bar, compare(before, after, self.block), weight)
+        yes = nats > bar and weight > 1 - s.open_share
+        return replace(turn, confirmed=found, accepted=yes)
+
+    def fine(self, fit: SurfelFit, name: str) -> SurfelFit:
+        """The scene as fine as the counts ask for, with the fit's terms.
+
+        Args:
+            fit: that goes on.
+            name: of the step.
+        """
+        text = f"refining the scene {name.replace('_', ' ')}"
+        return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
+
+    def again(self, best: Trial) -> SurfelFit:
+        """The parsimonious scene built anew with a trial's term, where that predicts better than the trial's:
+        surfels that imitated the term do not come back.
+        """
+        name = best.name
+        make = partial(_rebuilt, self.rebuild, best.fit.extension, self.seed)
+        other = self.steps("fit", f"rebuilding the scene with {name}", f"turn{self.number}_new_{name}", make)
+        if other is None:
+            return best.fit
+        value = log_likelihood(other, self.split.select)
+        return other if float(value.sum()) > float(best.likelihood.sum()) else best.fit
+
+    def _misfit(self, fit: SurfelFit) -> float:
+        """Of the spots that the pool is asked on."""
+        rows = tested_rows(fit, self.split, self.settings.spots, self.seed)
+        return misfit_of(fit, self.split.fit[rows])
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""
@@ -315,75 +378,33 @@ class Loop:
         fit.run(1, steps=WARM, settle=False)
         return solve_spots(fit)
 
-    def _beats(self, one: Trial, other: Trial) -> bool:
-        """It predicts better than the other, by more than the difference's error."""
-        gain = compare(other.likelihood, one.likelihood, self.block)
-        return gain.nats > self.settings.errors * gain.error
-
-    def _trials(self, before: Tensor, jobs: list[Job]) -> list[Trial]:
+    def _trials(self, jobs: list[Job]) -> list[Trial]:
         named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]
         fits = self.steps.several("fit", named, self.settings.processes)
-        trials = []
-        for (_, c, _), again in zip(jobs, fits, strict=True):
-            if again is not None:
-                value = log_likelihood(again, self.split.select)
-                trials.append(Trial(c, again, value, compare(before, value, self.block)))
-        return trials
+        values = [log_likelihood(f, self.split.select) for f in fits]
+        return [
+            Trial(c, f, v, compare(values[0], v, self.block))
+            for (_, c, _), f, v in zip(jobs, fits, values, strict=True)
+        ]
 
-    def refined(self, fit: SurfelFit, without: str = "") -> SurfelFit:
-        """The scene gone on with without one of its terms, then as fine as the counts ask for.
-
-        Args:
-            fit: with all terms.
-            without: name of the one; empty leaves all.
-
-        Returns:
-            another fit.
-        """
-        return solve_spots(self.grow(self._without(fit, without) if without else fit, self.seed))
-
-    def drop_needless(self, fit: SurfelFit) -> tuple[SurfelFit, dict[str, Comparison]]:
-        """Backward: without which terms does a fine scene predict as well?
-
-        A parsimonious scene lets effects be seen, and lets them stand for what it lacks. So each has to be
-        missed once the scene is as fine as the counts ask for, with it and without it.
+    def losses(self, fit: SurfelFit) -> dict[str, Comparison]:
+        """What each term's absence costs on the select spots, where the same scene goes on without it.
 
         Args:
-            fit: with all accepted terms.
+            fit: the final one.
 
         Returns:
-            the fine fit without needless terms, and what each other one's absence costs.
+            by name.
         """
-        while True:
-            names = [e.name for e in fit.extension.effects]
-            if not names:
-                return fit, {}
-            jobs: list[tuple[str, str, Callable[[], SurfelFit]]] = [
-                ("refining the scene", f"fine_{len(names)}", partial(self.refined, fit))
-            ]
-            for name in names:
-                key = f"without_{name}_of_{len(names)}"
-                jobs.append((f"refining the scene without {name}", key, partial(self.refined, fit, name)))
-            self.steps.plan(fit=len(jobs))
-            fine, *fewer = self.steps.several("fit", jobs, self.settings.processes)
-            value = log_likelihood(fine, self.split.select)
-            losses = {
-                name: compare(log_likelihood(other, self.split.select), value, self.block)
-                for name, other in zip(names, fewer, strict=True)
-            }
-            needless = [n for n, loss in losses.items() if loss.nats <= self.settings.sure * loss.error]
-            if not needless:
-                return fine, losses
-            least = min(needless, key=lambda n: losses[n].nats)
-            fit = fewer[0] if len(names) == 1 else self._without(fit, least)
-
-
-def best_of_each(trials: list[Trial]) -> list[Trial]:
-    """The better of a term's trials, the largest gain first."""
-    found: dict[str, Trial] = {}
-    for trial in sorted(trials, key=lambda t: -t.gain.nats):
-        found.setdefault(trial.name, trial)
-    return list(found.values())
+        names = [e.name for e in fit.extension.effects]
+        if not names:
+            return {}
+        jobs = [("going on with all", "all", partial(self._warm, fit, []))]
+        jobs += [(f"going on without {n}", f"all_but_{n}", partial(self._without, fit, n)) for n in names]
+        self.steps.plan(fit=len(jobs))
+        fits = self.steps.several("fit", jobs, self.settings.processes)
+        whole, *fewer = [log_likelihood(f, self.split.select) for f in fits]
+        return {n: compare(v, whole, self.block) for n, v in zip(names, fewer, strict=True)}
 
 
 def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
@@ -401,63 +422,63 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     return sorted(found, key=lambda t: -t.gain.nats)
 
 
-def finalists(trials: list[Trial], number: int) -> list[Trial]:
-    """With which terms the scene is built anew: those that gain most, and those with the most evidence.
-
-    Args:
-        trials: warm ones, the most evidence first.
-        number: of those that gain most.
-
-    Returns:
-        at most two more: the first, and the first effect that is the same law at all spots. Numbers of single
-        spots take up what is wrong there at once; a law has to drive the scene out first.
-    """
-    most = sorted(trials, key=lambda t: -t.gain.nats)[:number] + trials[:1]
-    most += [t for t in trials if is_law(t.candidate)][:1]
-    return [t for t in trials if any(t is m for m in most)]
-
-
 def is_law(candidate: Candidate | None) -> bool:
     """A term that is an effect, and not one with a number for each spot."""
     return candidate is not None and candidate.name not in FREE_NAMES and not candidate.effect.per_spot
 
 
-def leaders(wanted: list[Candidate], number: int) -> list[Candidate]:
-    """Which terms are tried: the best free one, the best with a number for each spot, the best effects.
+def leaders(candidates: list[Candidate], bar: float, number: int) -> list[Candidate]:
+    """Which terms are tried.
+
+    Half of the effects have the most evidence; the others would have, were their scatter their own: one
+    linear step towards a strong effect leaves an error that scatters like a misfit.
 
     Args:
-        wanted: most evidence first; below ``HOPELESS`` of the best there are no leaders.
-        number: of leaders.
+        candidates: most evidence first.
+        bar: nats that one of them needs, were its scatter its own; without there are no leaders.
+        number: of effects that are the same law at all spots; the best free term and the best with a number
+            for each spot come on top.
 
     Returns:
-        at most so many, most evidence first.
+        those, most evidence first.
     """
-    wanted = [c for c in wanted if c.evidence > HOPELESS * wanted[0].evidence]
-    laws = [c for c in wanted if is_law(c)]
-    others = [c for c in wanted if c.name in FREE_NAMES and not c.effect.per_spot][:1]
-    others += [c for c in wanted if c.effect.per_spot][:1]
-    return sorted(others + laws[: number - len(others)], key=lambda c: -c.evidence)
+    if not any(c.loud > bar for c in candidates):
+        return []
+    asked = [c for c in candidates if c.loud > 0]
+    laws = [c for c in asked if is_law(c)]
+    tried = laws[: number // 2]
+    rest = [c for c in laws if c not in tried]
+    tried += sorted(rest, key=lambda c: -c.loud)[: number - len(tried)]
+    tried += [c for c in asked if c.name in FREE_NAMES and not c.effect.per_spot][:1]
+    tried += [c for c in asked if c.effect.per_spot][:1]
+    return sorted(tried, key=lambda c: -c.evidence)
 
 
-def choose(trials: list[Trial], least: float) -> Trial:
-    """The simplest of those that the wall patches leave open.
-
-    An effect is simpler than a free term, and fewer coefficients are simpler than more.
+def left_open(trials: list[Trial], least: float, most_of: float) -> list[Trial]:
+    """Those that may be the best of their turn.
 
     Args:
-        trials: with a candidate and a weight each.
+        trials: of one turn, with weights, the largest gain first.
         least: weight above which a trial is open.
+        most_of: where a free term gains most, an effect with this share of its gain is open, too; what it
+            leaves is asked for in the next turn.
 
     Returns:
-        one of them; that of the largest weight where none is above.
+        the first, and all others that are open.
     """
+    enough = most_of * trials[0].gain.nats if trials[0].name in FREE_NAMES else math.inf
+    return [
+        t
+        for t in trials
+        if t is trials[0] or t.weight > least or (t.name not in FREE_NAMES and t.gain.nats > enough)
+    ]
 
-    def cost(t: Trial) -> tuple[bool, int, float]:
-        assert t.candidate is not None
-        return t.name in FREE_NAMES, len(t.candidate.step), -t.weight
 
-    heaviest = max(trials, key=lambda t: t.weight)
-    return min((t for t in trials if t.weight > least or t is heaviest), key=cost)
+def cost(trial: Trial) -> tuple[int, int, float]:
+    """Sort key, the simplest first: none, an effect, a free term; of two of a kind fewer coefficients."""
+    if trial.candidate is None:
+        return 0, 0, 0.0
+    return 1 + (trial.name in FREE_NAMES), len(trial.candidate.step), -trial.weight
 
 
 def criticise(
@@ -485,19 +506,29 @@ def criticise(
         base, turns and final fit.
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
-    fit, turns, grown, fine_base = base, [], False, False
-    while len(fit.extension.effects) < s.most:
-        turns.append(loop.turn(fit, grown))
-        taken = turns[-1].accepted
-        if taken is None:
-            break
-        fit = taken.fit
-        if taken.candidate is None:
+    first = fine = loop.fine(base, "without_effects")
+    coarse, turns, grown = base, [], False
+    while len(coarse.extension.effects) < s.most:
+        turn = loop.turn(fine if grown else coarse, fine)
+        if turn.best is None:
+            turns.append(turn)
+            if grown:
+                break
             grown = True
-            if not fit.extension.effects:
-                base, fine_base = fit, True
-    final, losses = loop.drop_needless(fit)
-    if fit.extension.effects and not fine_base:
-        refine = partial(loop.refined, base)
-        base = loop.steps("fit", "refining the scene without any effect", "fine_base", refine)
-    return Findings(base, final, turns, losses, fit if losses else None)
+            continue
+        if grown:
+            with_it, without = turn.best.fit, next(t.fit for t in turn.trials if t.candidate is None)
+        else:
+            with_it, without = loop.again(turn.best), fine
+            coarse_with = with_it
+            with_it = loop.fine(with_it, f"with_{turn.best.name}_{loop.number}")
+        turn = loop.confirm(turn, with_it, without)
+        turns.append(turn)
+        if turn.accepted:
+            fine = with_it
+            coarse = with_it if grown else coarse_with
+        elif grown:
+            break
+        else:
+            grown = True
+    return Findings(first, fine, turns, loop.losses(fine), coarse if fine is not first else None)

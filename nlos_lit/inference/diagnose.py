@@ -73,14 +73,14 @@ def diagnose(
         "fit",
         "fitting the base",
         "base",
-        lambda: pipeline.fit(capture, split, image, Extension([]), seed, fine=False),
+        lambda: pipeline.fit(capture, split, image, Extension([]), seed),
     )
     scan = lit_by(base, scan)
     steps.know(kinds(scan))
     steps.share({"counts": base.counts, "grid": base.grid, "reserve": base.reserve})
 
-    def rebuild(extension: Extension, with_seed: int, fine: bool) -> SurfelFit:
-        again = pipeline.fit(capture, split, image, extension, with_seed, fine)
+    def rebuild(extension: Extension, with_seed: int) -> SurfelFit:
+        again = pipeline.fit(capture, split, image, extension, with_seed)
         again.counts = base.counts
         return again
 

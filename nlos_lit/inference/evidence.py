@@ -12,13 +12,16 @@ is where it is largest (type-II likelihood; M. Tipping, *JMLR* 1, 2001). Scanned
 beforehand, so that the mean of their Bayes factors counts. Coefficients stay within their bounds: one that
 cannot be negative has no evidence where the counts want it to be.
 
-A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i between
-wall blocks, where it exceeds that of counts, divides scores and information (the sandwich of P. Huber, 1967,
-and of K.-Y. Liang and S. Zeger, *Biometrika* 73, 1986).
+A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i, where it
+exceeds that of counts, divides scores and information (the sandwich of P. Huber, 1967, and of K.-Y. Liang and
+S. Zeger, *Biometrika* 73, 1986). It is the larger of two: between wall blocks, and between the parts of each
+block that are early, later and late. The second holds maps over the wall and numbers of single spots to
+account, which could follow any block: what scales a spot's light scales all of it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +31,7 @@ from torch import Tensor
 from nlos_lit.effects.effect import Effect
 from nlos_lit.inference.problem import Problem
 
+SEGMENTS = 4  # parts of a wall block along time
 VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
 
 
@@ -89,14 +93,16 @@ class Evidence:
         error: ``[k]`` its standard deviation by counts alone.
         retained: share of the term's information that the base cannot imitate.
         scatter: φ, mean over the directions weighted by their scores.
+        loud: nats if all of the scatter were the term's own.
     """
 
     nats: float
     scale: float
     step: Tensor = field(repr=False)
     error: Tensor = field(repr=False)
-    retained: float = 1.0
-    scatter: float = 1.0
+    retained: float
+    scatter: float
+    loud: float
 
 
 def prior_deviations(effect: Effect) -> Tensor:
@@ -123,6 +129,7 @@ def evidence(
     block: Tensor,
     deviation: Tensor,
     bounds: tuple[Tensor, Tensor] | None = None,
+    at: Tensor | None = None,
 ) -> Evidence:
     """The log Bayes factor of a term.
 
@@ -133,18 +140,22 @@ def evidence(
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
+        at: ``[k]`` coefficients at which columns and residual were taken; None for the null.
 
     Returns:
         what the counts say of it.
     """
     z = z * deviation.float()
-    score = torch.einsum("stk,st->sk", z, residual).double()
-    information = torch.einsum("stk,stl->skl", z, z).double()
-    blocks = int(block.max()) + 1
-    s = score.new_zeros(blocks, score.shape[1]).index_add_(0, block, score)
-    f = score.new_zeros(blocks, *information.shape[1:]).index_add_(0, block, information)
+    cells = block[:, None] * SEGMENTS + torch.arange(SEGMENTS)
+    s = z.new_zeros(SEGMENTS * (int(block.max()) + 1), z.shape[2]).double()
+    f = s.new_zeros(len(s), z.shape[2], z.shape[2])
+    for k, (each, r) in enumerate(segments(z, residual)):
+        s.index_add_(0, cells[:, k], torch.einsum("stk,st->sk", each, r).double())
+        f.index_add_(0, cells[:, k], torch.einsum("stk,stl->skl", each, each).double())
     values, vectors = torch.linalg.eigh(f.sum(0))
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
+    if at is not None:
+        s = s + f @ (at.double() / deviation)
     u, tried = s.sum(0) @ vectors, torch.from_numpy(VARIANCES)[:, None]
 
     def best(scatter: Tensor, bounds: tuple[Tensor, Tensor] | None) -> tuple[float, float, Tensor]:
@@ -159,12 +170,13 @@ def evidence(
         k = int(nats.argmax())
         return (float(nats[k]), float(tried[k]), mean[k]) if nats[k] > 0 else (0.0, 0.0, torch.zeros_like(u))
 
-    mean = best(torch.ones_like(u), None)[2]
+    loud, _, mean = best(torch.ones_like(u), None)
     left = (s - f @ mean) @ vectors
-    scatter = (left.square().sum(0) / values).clamp_min(1.0)
+    blocks = left.view(-1, SEGMENTS, left.shape[1]).sum(1)
+    scatter = torch.maximum(left.square().sum(0), blocks.square().sum(0)).div(values).clamp_min(1.0)
+    share = u.square() / values
     nats, variance, mean = best(scatter, bounds)
     whole = (raw.double().square().sum((0, 1)) * deviation**2).clamp_min(1e-30)
-    share = u.square() / values
     return Evidence(
         nats=nats,
         scale=variance**0.5,
@@ -172,4 +184,20 @@ def evidence(
         error=((vectors.square() @ (scatter / values)).sqrt() * deviation).float(),
         retained=float((f.sum(0).diagonal() / whole).mean()),
         scatter=float((scatter * share).sum() / share.sum().clamp_min(1e-30)),
+        loud=loud,
     )
+
+
+def segments(z: Tensor, residual: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Columns and residual in ``SEGMENTS`` parts along time that hold about as much information each.
+
+    Args:
+        z: ``[S, T, k]``.
+        residual: ``[S, T]``.
+
+    Yields:
+        their parts.
+    """
+    told = z.square().sum((0, 2)).double().cumsum(0)
+    cuts = torch.searchsorted(told, told[-1] * torch.arange(1, SEGMENTS) / SEGMENTS).tolist()
+    yield from zip(z.tensor_split(cuts, 1), residual.tensor_split(cuts, 1), strict=True)

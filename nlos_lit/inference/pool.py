@@ -15,7 +15,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.evidence import Evidence, Projector, evidence, prior_deviations, step_bounds
+from nlos_lit.inference.evidence import SEGMENTS, Evidence, Projector, evidence, prior_deviations, step_bounds
 from nlos_lit.inference.per_spot import best_width, coefficients, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
@@ -39,6 +39,8 @@ class Candidate:
         scatter: how much more its scores scatter between wall blocks than counts do.
         shape: scanned parameters.
         step: ``[k]`` change of the stored amplitudes that the counts ask for. error: of it.
+        loud: nats if all of the scatter were the term's own, as it is of a strong one: one linear step leaves
+            an error that scatters like a misfit.
     """
 
     effect: Effect
@@ -48,6 +50,7 @@ class Candidate:
     shape: Shape
     step: Tensor = field(repr=False)
     error: Tensor = field(repr=False)
+    loud: float
 
     @property
     def name(self) -> str:
@@ -111,13 +114,55 @@ def ask(fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int) -> list[
     Returns:
         one candidate a term, with a copy of it at its best shape.
     """
+    problem, block = _problem(fit, split, most, seed)
+    have = {e.name for e in fit.extension.effects}
+    return screen(problem, [e(scan) for e in [*EFFECTS, *FREE] if e.name not in have], block)
+
+
+def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) -> float:
+    """How much the counts ask for a term that a fit has, beside all else that the fit has and may do.
+
+    Args:
+        fit: with the term at its fitted value.
+        split: of its spots.
+        most: fitted spots that are looked at.
+        seed: of their choice.
+        name: of the term.
+
+    Returns:
+        nats, as of a candidate.
+    """
+    effect = next(e for e in fit.extension.effects if e.name == name)
+    problem, block = _problem(fit, split, most, seed, without=effect)
+    projector, shapes = Projector(problem), len(effect.shape_grid())
+    null = copy.deepcopy(effect)
+    for p in null.amplitudes:
+        null.set(p.name, 0.0 if p.null is None else p.null)
+    at = _amplitudes(effect) - _amplitudes(null)
+    columns = weighted_columns(problem, effect)
+    if effect.per_spot:
+        column = columns[:, 0].view(problem.expected.shape)
+        score, information, _ = _scores(column, projector, at[problem.spots])
+        return best_width(score, information, sparse(effect))[0] - math.log(shapes)
+    z = projector.off(columns)
+    return _evidence(problem, projector.residual, effect, columns, z, block, at).nats - math.log(shapes)
+
+
+def _amplitudes(effect: Effect) -> Tensor:
+    return torch.cat([getattr(effect, f"raw_{p.name}").detach() for p in effect.amplitudes])
+
+
+def _problem(
+    fit: SurfelFit, split: Split, most: int, seed: int, without: Effect | None = None
+) -> tuple[Problem, Tensor]:
+    """The linear problem of a fit's tested spots, and the number of each one's wall block."""
     rows = tested_rows(fit, split, most, seed)
     spots = torch.from_numpy(split.fit[rows])
     patches = patches_for(len(rows) * fit.counts.shape[1])
-    problem = build_problem(fit.model, fit.extension, spots, fit.counts[rows], patches=patches)
-    block = torch.from_numpy(np.unique(split.block[split.fit[rows]], return_inverse=True)[1])
-    have = {e.name for e in fit.extension.effects}
-    return screen(problem, [e(scan) for e in [*EFFECTS, *FREE] if e.name not in have], block)
+    problem = build_problem(
+        fit.model, fit.extension, spots, fit.counts[rows], patches=patches, without=without
+    )
+    return problem, torch.from_numpy(np.unique(split.block[split.fit[rows]], return_inverse=True)[1])
 
 
 def screen(problem: Problem, effects: list[Effect], block: Tensor) -> list[Candidate]:
@@ -143,34 +188,42 @@ def screen(problem: Problem, effects: list[Effect], block: Tensor) -> list[Candi
             for shape, columns in kept:
                 part = z[:, start : start + columns.shape[1]]
                 start += columns.shape[1]
-                tried.append((shape, _evidence(problem, projector, effect, columns, part, block)))
+                tried.append((shape, _evidence(problem, projector.residual, effect, columns, part, block)))
             found.append(_candidate(effect, tried))
     return sorted(found, key=lambda c: -c.evidence)
 
 
 def _evidence(
-    problem: Problem, projector: Projector, effect: Effect, columns: Tensor, z: Tensor, block: Tensor
+    problem: Problem,
+    residual: Tensor,
+    effect: Effect,
+    columns: Tensor,
+    z: Tensor,
+    block: Tensor,
+    at: Tensor | None = None,
 ) -> Evidence:
     shape = (*problem.expected.shape, -1)
-    residual = projector.residual.view(problem.expected.shape)
     return evidence(
         columns.reshape(shape),
         z.reshape(shape),
-        residual,
+        residual.view(problem.expected.shape),
         block,
         prior_deviations(effect),
         step_bounds(effect),
+        at,
     )
 
 
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:
     """The best shape; the evidence is the mean of the Bayes factors of all that could have been."""
-    shape, best = max(tried, key=lambda entry: entry[1].nats)
+    shape, best = max(tried, key=lambda entry: (entry[1].nats, entry[1].loud))
     mean = mean_factor([e.nats for _, e in tried], len(effect.shape_grid()))
     effect.set_all(shape)
     if bool(effect.precision().any()) and best.scale:
         effect.prior_scale = best.scale
-    return Candidate(effect, mean, best.retained, best.scatter, shape, best.step, best.error)
+    return Candidate(
+        effect, mean, best.retained, best.scatter, shape, best.step, best.error, max(mean, best.loud)
+    )
 
 
 def mean_factor(nats: list[float], number: int) -> float:
@@ -237,17 +290,48 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     for shape in shapes:
         effect.set_all(shape)
         column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
-        score = (column * projector.residual.view_as(column)).sum(1).double()
-        information = (column**2).sum(1).double().clamp_min(1e-30)
+        score, information, scatter = _scores(column, projector)
         gain, width, share = best_width(score, information, sparse(effect))
         nats.append(gain)
         if best is None or gain > best[0]:
-            best = gain, width, share, shape, score, information
+            best = gain, width, share, shape, score, information, scatter
     assert best is not None
-    _, effect.width, effect.share, shape, score, information = best
+    _, effect.width, effect.share, shape, score, information, scatter = best
     effect.set_all(shape)
     full = torch.zeros(len(problem.model.laser))
     full[problem.spots] = coefficients(score, information, effect.width, sparse(effect)).float()
     error = torch.full_like(full, float("nan"))
     error[problem.spots] = information.rsqrt().float()
-    return Candidate(effect, mean_factor(nats, len(shapes)), 1.0, 1.0, shape, full, error)
+    nats_of_all = mean_factor(nats, len(shapes))
+    return Candidate(effect, nats_of_all, 1.0, scatter, shape, full, error, nats_of_all)
+
+
+def _scores(column: Tensor, projector: Projector, at: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
+    """Score and information of each spot's own coefficient ``[S]``, discounted by their scatter, and that."""
+    residual = projector.residual.view_as(column)
+    information = column.square().sum(1).double().clamp_min(1e-30)
+    score = (column * residual).sum(1).double()
+    scatter = spot_scatter(column, residual)
+    if at is not None:
+        score = score + information * at
+    return score / scatter, information / scatter, scatter
+
+
+def spot_scatter(column: Tensor, residual: Tensor) -> float:
+    """How much more the scores of a spot's own coefficient differ along time than counts alone let them.
+
+    Args:
+        column: ``[S, T]`` of each spot's own coefficient.
+        residual: ``[S, T]``.
+
+    Returns:
+        φ, at least 1.
+    """
+    told = column.square().double()
+    passed = (told.cumsum(1) - told / 2) / told.sum(1, keepdim=True).clamp_min(1e-30)
+    parts = (passed * SEGMENTS).long().clamp_max(SEGMENTS - 1)
+    f = told.new_zeros(len(column), SEGMENTS).scatter_add_(1, parts, told)
+    s = told.new_zeros(len(column), SEGMENTS).scatter_add_(1, parts, (column * residual).double())
+    mean = s.sum(1, keepdim=True) / f.sum(1, keepdim=True).clamp_min(1e-30)
+    left = (s - f * mean).square() / f.clamp_min(1e-30)
+    return max(1.0, float(left.sum() / max(1, int((f > 0).sum()) - len(column))))

@@ -27,11 +27,11 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.functional.smooth_basis import smooth_map_basis
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
 
-TILT_PRIOR = 0.1  # rad: how far normals may lean together, away from the surface's own slope
+TILT_PRIOR = 0.2  # rad: how far the normals of a patch may lean from the surface's own slope
+TILTED = 32  # patches
 CHUNK = 1 << 25  # elements of a batch's columns
 
 
@@ -73,6 +73,7 @@ def build_problem(
     counts: Tensor,
     with_effects: bool = True,
     patches: int | None = None,
+    without: Effect | None = None,
 ) -> Problem:
     """Nuisance columns and residual of some spots.
 
@@ -84,6 +85,7 @@ def build_problem(
         with_effects: parameters of the extension's effects are nuisance, too.
         patches: surfels that are near each other share their columns, so that there are at most as many;
             None leaves each its own.
+        without: one of the extension's effects whose parameters are none.
 
     Returns:
         the problem.
@@ -107,7 +109,7 @@ def build_problem(
             both.append(_jvp(whole, "model.raw_passing", model.raw_passing, torch.tensor(1.0)))
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
-    accepted = [e for e in extension.effects if with_effects and not e.per_spot]
+    accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]
     more = [effect_columns(model, extension, spots, e, shapes=True, transients=transients) for e in accepted]
     nuisance = torch.cat([torch.cat(surfels), torch.cat(others), *more], 1)
     weight = expected.reshape(-1).rsqrt()
@@ -355,12 +357,8 @@ def patches_of(model: SurfelModel, most: int) -> Tensor:
 
 
 def tilt_fields(model: SurfelModel) -> Tensor:
-    """``[M, F]`` smooth functions over the hidden scene (mean square 1 each), the constant first."""
-    xy = model.centre().detach()[:, :2]
-    low, high = xy.amin(0), xy.amax(0)
-    place = 2 * (xy - low) / (high - low).clamp_min(1e-6) - 1
-    fields = smooth_map_basis(place, 5)[0] if len(xy) > 50 else place[:, :0]
-    return torch.cat([torch.ones(len(xy), 1), fields], 1)
+    """``[M, F]`` which patch each surfel lies in, of ``TILTED`` at most whose normals lean together."""
+    return torch.nn.functional.one_hot(patches_of(model, TILTED)).to(model.centre().dtype)
 
 
 def tilt_frame(normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,8 +14,8 @@ from blind_truth import CASES, Spec
 from nlos_lit.inference.criticise import CriticismSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
-# Fewer spots and rebuilds than a diagnosis takes.
-QUICK = CriticismSettings(spots=256, finalists=1, most=1)
+# Fewer spots and terms than a diagnosis takes.
+QUICK = CriticismSettings(spots=256, most=1)
 WHOLE = CriticismSettings()
 HARD = {
     "retroreflection": "without cosines the counts do not tell normals; the base breaks (docs/criticism.md)",
@@ -64,7 +64,7 @@ def test_two_effects_are_both_named_and_measured():
     reason="said to be unknown from spot to spot instead of along the scan (docs/criticism.md)", strict=False
 )
 def test_what_no_effect_explains_is_called_unexplained():
-    """Mains ripple along the scan: fifteen cycles are too many for the drift's five coefficients."""
+    """Mains ripple along the scan: fifteen cycles are too many for the drift's 23 coefficients."""
     check(run_case(Spec("default", ("mains_ripple",), (2,), 1500, 15), QUICK, oracle=False))
 
 

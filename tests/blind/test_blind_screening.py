@@ -58,11 +58,11 @@ def test_what_is_hidden_is_asked_for(name, tmp_path):
     capture = read_capture(tmp_path / "capture.hdf5", "auto")
     pipeline = dataclasses.replace(pipeline_for(capture), surfels=QUICK)
     split, scan = split_spots(capture), Scan.of(capture)
-    fit = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0, fine=False)
+    fit = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
     found = ask(fit, split, scan, 160, 0)
     place = [c.name for c in found].index(name)
     said = [(c.name, round(c.evidence)) for c in found[: place + 1]]
-    assert found[place].evidence > needed(found, CriticismSettings()), said
+    assert found[place].evidence > needed(found, CriticismSettings(), 0.0), said
     assert place <= 1, said
     if place:
         before = found[0].name

@@ -85,8 +85,8 @@ def unit(n: int, k: int) -> Tensor:
 @pytest.mark.parametrize("accepted", ACCEPTED)
 @pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
 def test_nuisance_is_the_slope_of_the_render(kind, accepted):
-    """Albedos in units of themselves, depths in bins, tilts of all normals, response, effects accepted
-    before.
+    """Albedos in units of themselves, depths in bins, tilts of each normal (surfels are few), response,
+    effects accepted before.
     """
     model, extension, _, spots = setting(kind, accepted)
     m = len(model)
@@ -107,7 +107,10 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     for k in range(m):
         changes.append(lambda mo, ex, h, k=k: mo.raw_depth.add_(h * unit(m, k)))
     for direction in lean:
-        changes.append(lambda mo, ex, h, d=direction: mo.raw_normal.copy_(normal + h * d))
+        for k in range(m):
+            changes.append(
+                lambda mo, ex, h, k=k, d=direction: mo.raw_normal.copy_(normal + h * unit(m, k)[:, None] * d)
+            )
     for name in ("sigma_ls", "kappa_s", "intensity", "background"):
         changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
     changes.append(lambda mo, ex, h: mo.raw_passing.add_(h))
@@ -118,7 +121,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     ours = problem.nuisance * expected.reshape(-1, 1).sqrt()
     assert ours.shape == (4 * 58, len(changes))
     for k, change in enumerate(changes):
-        rounded = k >= 2 * m + 2
+        rounded = k >= 4 * m
         numeric = slope(model, extension, spots, change, ROUGH if rounded else FINE)
         assert float(numeric.abs().max()) > 0, f"column {k} is nothing"
         tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
@@ -130,16 +133,14 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     assert torch.equal(free.nuisance, problem.nuisance[:, : free.nuisance.shape[1]])
 
 
-def test_smooth_tilts_lean_many_surfels_together():
-    """More than fifty surfels lean by smooth functions of their place, orthonormal, each with the prior of a
-    tenth of a radian.
-    """
+def test_normals_of_a_patch_lean_together():
+    """56 surfels are 32 patches, near ones together, each with the prior of a fifth of a radian."""
     model, extension, _, spots = setting("confocal", number=56)
     fields = tilt_fields(model)
     f, m = fields.shape[1], len(model)
-    assert f > 10
-    assert torch.allclose(fields.T @ fields / m, torch.eye(f), atol=1e-6)
-    assert torch.equal(fields[:, 0], torch.ones(m))
+    assert f == 32
+    assert torch.equal(fields.sum(1), torch.ones(m))
+    assert set(fields.sum(0).tolist()) == {1.0, 2.0}
     problem = build_problem(model, extension, spots, torch.zeros(4, 58))
     lean = torch.zeros(2 * m + 2 * f + 5)
     lean[2 * m : 2 * m + 2 * f] = 1 / TILT_PRIOR**2

@@ -28,7 +28,7 @@ SCENE = [
 ]
 SMALL = [
     "surfels.contest=40", "surfels.rounds=2", "surfels.steps=40", "surfels.more=0",
-    "criticism.spots=96", "criticism.rivals=1", "criticism.finalists=1", "criticism.most=1", "threads=1",
+    "criticism.spots=96", "criticism.rivals=1", "criticism.most=1", "threads=1",
 ]  # fmt: skip
 FIGURES = [
     "residual_time",

@@ -17,7 +17,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.heldout import Comparison
 from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.problem import build_problem, weighted_columns
@@ -145,7 +145,8 @@ def test_covariance_is_the_inverse_of_the_whole_information():
     fit, spots, block = accepted_fit(seed=None)
     found = Uncertainty(fit, spots, fit.counts, block)
     inverse, _, _ = dense(fit, spots)
-    assert torch.allclose(found.covariance, inverse, rtol=2e-3)
+    # Tilts of single surfels are nearly dependent, and products are in single precision.
+    assert torch.allclose(found.covariance, inverse, rtol=5e-3)
     estimate = found.parameters(fit.extension.effects[1])["detections"]
     assert estimate.value == pytest.approx(0.3, rel=1e-5)
     assert estimate.stderr == pytest.approx(0.05 * float(inverse[1, 1]) ** 0.5, rel=1e-3)
@@ -191,7 +192,7 @@ def found_candidate(name: str, scan: Scan, evidence: float, step: Tensor | float
     effect = effect_of(name, scan)
     size = sum(p.size for p in effect.amplitudes)
     steps = torch.full((size,), step) if isinstance(step, float) else step
-    return Candidate(effect, evidence, 0.4, 1.5, {}, steps, torch.full((size,), 0.1))
+    return Candidate(effect, evidence, 0.4, 1.5, {}, steps, torch.full((size,), 0.1), evidence)
 
 
 @pytest.fixture(scope="module")
@@ -211,6 +212,9 @@ def findings():
         one = found_candidate(name, scan, evidence)
         return Trial(one, final, nothing, Comparison(gain, 1.0, (gain - 2, gain + 2)), weight)
 
+    def kept(evidence: float) -> Confirmed:
+        return Confirmed(evidence, 8.0, Comparison(40.0, 1.0, (38, 42)), 1.0)
+
     first = [
         found_candidate(n, scan, e)
         for n, e in (("irf_tail", 500.0), ("afterpulsing", 400.0), ("free_wall", 90.0), ("free_time", 4.0))
@@ -219,9 +223,11 @@ def findings():
     rival, beside = trial("afterpulsing", 400.0, 290.0, 0.2), trial("free_wall", 90.0, 80.0, 0.1)
     control = Trial(None, base, nothing, Comparison(1.0, 1.0, (-1, 3)), 0.1)
     turns = [
-        Turn(first, [won, rival, beside, control], won, ["afterpulsing", "free_wall"]),
-        Turn(first[1:], [second], second, []),
-        Turn(first[3:], [], None, []),
+        Turn(
+            first, 8.0, [won, rival, beside, control], won, ["afterpulsing", "free_wall"], kept(450.0), True
+        ),
+        Turn(first[1:], 8.0, [second], second, [], kept(80.0), True),
+        Turn(first[3:], 8.0),
     ]
     losses = {"irf_tail": Comparison(250.0, 5.0, (240, 260)), "free_wall": Comparison(60.0, 5.0, (50, 70))}
     return Findings(base, final, turns, losses), measured, split, scan
@@ -236,12 +242,12 @@ def diagnosed(findings, null: Null | None = None):
 def test_what_is_said_of_accepted_terms(findings):
     said = diagnosed(findings)
     (tail,), (free,) = said.effects, said.unknown
-    # Six and two tenths remain when the map, which was accepted beside, is no rival, nor is more scene.
+    # Six and two tenths remain when the map, which was accepted beside, is no rival, nor is none.
     assert tail.weights == pytest.approx({"irf_tail": 0.75, "afterpulsing": 0.25})
     assert tail.confusable_with == ["afterpulsing"]
     assert "background" in tail.split_by
     assert said.groups == [["irf_tail", "afterpulsing"]]
-    assert (tail.evidence, tail.axis, tail.shape) == (500, "", None)
+    assert (tail.evidence, tail.axis, tail.shape) == (450, "", None)
     assert tail.parameters["fraction"].value == pytest.approx(0.2)
     _, measured, split, _ = findings
     photons, bins = measured.gated_counts()[split.select].sum(), len(split.select) * 58
@@ -255,10 +261,10 @@ def test_what_is_said_of_accepted_terms(findings):
     assert (said.unexplained.significant, said.unexplained.axis, said.unexplained.evidence) == (
         True,
         "wall",
-        90,
+        80,
     )
     assert [s.name for s in said.screened] == ["irf_tail", "afterpulsing", "free_wall", "free_time"]
-    assert said.needed == pytest.approx(math.log(4 / 0.01))
+    assert said.needed == 8
 
 
 @FORWARD_MODE
@@ -279,7 +285,7 @@ def test_without_an_unknown_term_the_likeliest_axis_is_told(findings):
 
 @FORWARD_MODE
 def test_the_chance_is_that_of_toys_or_of_theory(findings):
-    assert diagnosed(findings).chance == pytest.approx(4 * math.exp(-500))
+    assert diagnosed(findings).chance == pytest.approx(0.01 * math.exp(8 - 500))
     said = diagnosed(findings, Null([600.0, 3.0, 1.0]))
     assert (said.chance, said.toys) == (0.5, 3)
 
@@ -294,25 +300,25 @@ def test_what_would_be_seen():
 def test_screened_in_units_of_the_parameters():
     tail = effect_of("irf_tail", SCAN, decay=0.11)
     found = _screened(
-        Candidate(tail, 30.0, 0.4, 1.0, {"decay": 0.11}, torch.tensor([2.0]), torch.tensor([0.3])), 8.3
+        Candidate(tail, 30.0, 0.4, 1.0, {"decay": 0.11}, torch.tensor([2.0]), torch.tensor([0.3]), 30.0), 8.3
     )
     assert found.one_step["fraction"] == pytest.approx(0.1)
     assert found.detectable["fraction"] == pytest.approx((visible_score(8.3) + 1.2816) * 0.05 * 0.3)
     assert (found.degrees, found.shape, found.evidence) == (1, {"decay": 0.11}, 30)
     retro = effect_of("retroreflection", SCAN)
-    found = _screened(Candidate(retro, 9.0, 0.4, 1.0, {}, torch.tensor([-1.0, 0.5]), torch.ones(2)), 8.3)
+    found = _screened(Candidate(retro, 9.0, 0.4, 1.0, {}, torch.tensor([-1.0, 0.5]), torch.ones(2), 9.0), 8.3)
     scale = {p.name: p.scale for p in retro.amplitudes}
     assert found.one_step == pytest.approx(
         {"falloff": 4 - scale["falloff"], "cosine": 1 + 0.5 * scale["cosine"]}
     )
     drift = effect_of("power_drift", SCAN)
     found = _screened(
-        Candidate(drift, 30.0, 0.4, 1.0, {}, torch.tensor([1.0, 2, 0, 2, 0]), torch.full((5,), 0.2)), 8.3
+        Candidate(drift, 30.0, 0.4, 1.0, {}, 2 * torch.ones(23), torch.full((23,), 0.2), 30.0), 8.3
     )
-    assert found.one_step["drift"] == pytest.approx(0.05 * (9 / 5) ** 0.5)
+    assert found.one_step["drift"] == pytest.approx(0.05 * 2)
     hot = effect_of("hot_spots", SCAN)
     error = torch.tensor([float("nan"), 2.0, 2.0])
-    found = _screened(Candidate(hot, 9.0, 1.0, 1.0, {}, torch.zeros(3), error), 8.3)
+    found = _screened(Candidate(hot, 9.0, 1.0, 1.0, {}, torch.zeros(3), error, 9.0), 8.3)
     assert (found.degrees, found.one_step) == (2, {})
     visible = visible_score(8.3) + 1.2816
     assert found.detectable["extra"] == pytest.approx(visible * hot.declared["extra"].scale * 2)

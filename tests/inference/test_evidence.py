@@ -15,6 +15,7 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
+from nlos_lit.inference import evidence as evidence_module
 from nlos_lit.inference import pool
 from nlos_lit.inference.evidence import (
     VARIANCES,
@@ -31,6 +32,7 @@ from nlos_lit.inference.problem import Problem
 SPOTS, BINS, DRAWS = 42, 6, 200
 ROWS = SPOTS * BINS
 SCAN = Scan.of(capture_of(scattered(SPOTS)))
+TRUTH = torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0] + [0.0] * 18)  # a drift's coefficients
 BLOCK = torch.arange(SPOTS)
 
 
@@ -80,8 +82,12 @@ def test_evidence_grows_with_the_square_of_the_score(u):
         assert found.error.item() == pytest.approx(information**-0.5, rel=1e-5)
 
 
-def test_several_coefficients_are_a_gaussian_process():
-    """Against the marginal likelihood of the counts themselves, with covariance I + τ²ZCZᵀ, and its mean."""
+def test_several_coefficients_are_a_gaussian_process(monkeypatch):
+    """Against the marginal likelihood of the counts themselves, with covariance I + τ²ZCZᵀ, and its mean.
+
+    One block and one part of it: nothing scatters.
+    """
+    monkeypatch.setattr(evidence_module, "SEGMENTS", 1)
     z = normal(ROWS, 4, seed=1) * torch.tensor([1.0, 0.3, 2.0, 0.1])
     z[:, 3] += z[:, 0]
     deviation = torch.tensor([1.0, 3.0, 0.1, 0.5]).double()
@@ -222,7 +228,9 @@ def columns(effect: Effect, strength: float = 10.0) -> Tensor:
 
 @lru_cache
 def own_columns(k: int, seed: int) -> Tensor:
-    return normal(ROWS, k, seed=seed) + normal(ROWS, 7, seed=1)[:, :k]
+    own, shared = normal(ROWS, k, seed=seed), normal(ROWS, 7, seed=1)[:, :k]
+    own[:, : shared.shape[1]] += shared
+    return own
 
 
 @pytest.fixture
@@ -254,14 +262,15 @@ def test_counts_alone_seldom_give_evidence(name, known):
 
 def test_one_step_is_unbiased_and_its_error_right(known):
     effect = effect_of("power_drift", SCAN)
-    truth = torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0])
+    truth = TRUTH
     found = [look("power_drift", r) for r in residuals(columns(effect) @ truth, seed=4)]
-    steps = torch.stack([c.step for c in found])
+    steps = torch.stack([c.step for c in found])[:, :5]  # rougher ones are shrunk towards nothing
+    truth = truth[:5]
     z = Projector(problem(torch.zeros(ROWS))).off(columns(effect)).double()
-    errors = torch.linalg.inv(z.T @ z).diagonal().sqrt().float()
+    errors = torch.linalg.inv(z.T @ z).diagonal().sqrt().float()[:5]
     assert torch.all((steps.mean(0) - truth).abs() < 4 * errors / math.sqrt(DRAWS) + 0.02 * truth.abs())
     assert torch.allclose(steps.std(0), errors, rtol=4 / math.sqrt(2 * DRAWS))
-    ratio = torch.stack([c.error for c in found]) / errors
+    ratio = torch.stack([c.error for c in found])[:, :5] / errors
     assert torch.all(ratio >= 0.999), "errors are no smaller than counts alone leave them"
     assert torch.all(ratio.mean(0) < 1.2)
     assert min(c.evidence for c in found) > 100
@@ -340,7 +349,7 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
 def test_terms_are_projected_together(monkeypatch, known):
     """No more than some columns at a time, and each term gets its own again."""
     given = [effect_of(n, SCAN) for n in ("irf_tail", "power_drift", "time_offset", "gate_edges")]
-    truth = columns(given[1]) @ torch.tensor([4.0, -4.0, 4.0, -4.0, 4.0]) + normal(ROWS, seed=11)
+    truth = columns(given[1]) @ (2 * TRUTH) + normal(ROWS, seed=11)
     together = screen(problem(truth), given, BLOCK)
     monkeypatch.setattr(pool, "TOGETHER", 1)
     apart = screen(problem(truth), given, BLOCK)
@@ -352,7 +361,7 @@ def test_terms_are_projected_together(monkeypatch, known):
 
 def test_a_term_with_a_prior_keeps_its_scale(known):
     effect = effect_of("power_drift", SCAN)
-    truth = columns(effect) @ torch.tensor([2.0, -1.0, 0.5, 0.0, 3.0]) + normal(ROWS, seed=5)
+    truth = columns(effect) @ TRUTH + normal(ROWS, seed=5)
     found = look("power_drift", truth)
     ratio = found.step / prior_deviations(effect).float()
     assert found.effect.prior_scale in VARIANCES**0.5
@@ -384,17 +393,48 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     wide.model = type("Model", (), {"laser": torch.zeros(SPOTS + 3, 3)})()
     (found,) = screen(wide, [effect_of("timing_jitter", SCAN)], BLOCK)
     assert found.effect.width == pytest.approx(1.5, rel=0.3)
-    grown = 1 + 6 * found.effect.width**2
-    score = Projector(wide).residual.view(SPOTS, BINS).sum(1).double()
+    grown = 1 + 6 / found.scatter * found.effect.width**2
+    score = Projector(wide).residual.view(SPOTS, BINS).sum(1).double() / found.scatter
     by_hand = 0.5 * (found.effect.width**2 * score**2 / grown - math.log(grown)).sum()
     assert found.evidence == pytest.approx(float(by_hand), rel=1e-3)
     assert found.evidence > 20
     assert found.step.shape == (SPOTS + 3,)
     assert torch.equal(found.step[[0, 1, SPOTS + 2]], torch.zeros(3))
     assert np.corrcoef(found.step[2:-1], delta)[0, 1] > 0.95
-    assert found.error[5].item() == pytest.approx(6**-0.5, rel=1e-4)
+    assert found.error[5].item() == pytest.approx((6 / found.scatter) ** -0.5, rel=1e-4)
     assert torch.isnan(found.error[0])
     calm = problem(0.8 * normal(ROWS, seed=14), nuisance)
     calm.model = type("Model", (), {"laser": torch.zeros(SPOTS, 3)})()
     (nothing,) = screen(calm, [effect_of("timing_jitter", SCAN)], BLOCK)
     assert nothing.evidence < 0.5
+
+
+def test_a_misfit_that_changes_along_time_holds_a_map_to_account():
+    """One coefficient for each of three blocks, which follows any of them. What is wrong in a block's first
+    quarter alone scatters between its parts; what scales all of a block does not.
+    """
+    block = torch.arange(12) // 4
+    z = torch.nn.functional.one_hot(block).float()[:, None, :].expand(-1, 8, -1).contiguous()
+    whole = 3.0 * torch.tensor([1.0, -1.0, 0.5])[block][:, None].expand(-1, 8)
+    early = whole * 4 * (torch.arange(8) < 2)
+    unit = torch.ones(3).double()
+    found = [evidence(z, z, r.contiguous(), block, unit) for r in (whole, early)]
+    assert (found[0].scatter, found[0].nats) == (1, pytest.approx(found[0].loud))
+    assert found[1].loud == pytest.approx(found[0].loud, rel=1e-5)
+    assert found[1].scatter > 50
+    assert found[1].nats < found[0].nats / 50
+
+
+def test_scatter_of_a_spots_own_coefficient_by_hand():
+    """Four parts of information 2 with scores 2 a + n: left are the n off their mean."""
+    column = torch.ones(3, 8)
+    noise = torch.tensor([1.0, -1.0, 1.0, -1.0])
+    residual = (torch.tensor([5.0, 0.0, -2.0])[:, None] + 2 * noise).repeat_interleave(2, 1)
+    assert pool.spot_scatter(column, residual) == pytest.approx(4 * 2 * 4 / 3)
+    assert pool.spot_scatter(column, torch.full((3, 8), 7.0)) == 1
+
+
+def test_scatter_of_a_spots_own_coefficient_is_that_of_counts():
+    assert pool.spot_scatter(normal(400, 30, seed=3).abs(), normal(400, 30, seed=4)) == pytest.approx(
+        1, abs=0.1
+    )

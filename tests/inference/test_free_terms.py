@@ -225,3 +225,13 @@ def test_rows_are_a_fixed_choice_of_the_fitted_ones():
     assert np.array_equal(rows, pool.tested_rows(None, Split, 30, seed=3))
     assert not np.array_equal(rows, pool.tested_rows(None, Split, 30, seed=4))
     assert np.array_equal(pool.tested_rows(None, Split, 1000, seed=3), np.arange(100))
+
+
+def test_a_changed_response_is_differentiated_where_it_is():
+    """Changes of the response at single spots add up at the null alone: elsewhere each coefficient has a
+    derivative of its own.
+    """
+    term = effect_of("free_response_wall", Scan.of(capture_of(raster(16))))
+    assert term.factors(torch.arange(3)) is not None
+    term.set("field", 0.1)
+    assert term.factors(torch.arange(3)) is None
