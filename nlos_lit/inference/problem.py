@@ -4,9 +4,9 @@ least-squares problem.
 Rows are gated bins of the looked-at spots, divided by √μ, so that counts of the model itself have unit
 variance.
 
-- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, smooth tilts of all
-  normals, the laser-sensor response, what passes the sheets in front, and the parameters of effects that were
-  accepted before.
+- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, how bright each
+  patch of the scene is from where on the wall, the laser-sensor response, what passes the sheets in front,
+  and the parameters of effects that were accepted before.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
@@ -30,8 +30,8 @@ from nlos_lit.effects.free_terms import FREE
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
 
-TILT_PRIOR = 0.2  # rad: how far the normals of a patch may lean from the surface's own slope
-TILTED = 32  # patches
+PATCHES = 32  # of the scene, each of which looks a little brighter from some wall points than from others …
+UNEVEN = 0.05  # … by so much (rms over the wall): normals, relief and hidden sides are not known better
 CHUNK = 1 << 25  # elements of a batch's columns
 
 
@@ -93,15 +93,15 @@ def build_problem(
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m, first = len(model), model.gate[0]
-    tilts, patch = tilt_fields(model), patches_of(model, patches or m)
+    towards, patch = towards_wall(model), patches_of(model, patches or m)
     n_patches = int(patch.max()) + 1
-    size = max(1, CHUNK // (model.n_bins * (3 * m + 64)))
+    size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
         with torch.no_grad():
             light.append(model.transients(model.paths(part), part, extension))
-        surfels.append(_surfel_columns(model, extension, part, light[-1], tilts, patch))
+        surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
         if len(model.visible):
@@ -116,7 +116,8 @@ def build_problem(
     nuisance *= weight[:, None]
     residual = (counts - expected).reshape(-1) * weight
     prior = torch.zeros(nuisance.shape[1])
-    prior[2 * n_patches : 2 * n_patches + 2 * tilts.shape[1]] = 1 / TILT_PRIOR**2
+    uneven = towards.shape[1] * (int(patches_of(model, PATCHES).max()) + 1)
+    prior[2 * n_patches : 2 * n_patches + uneven] = 1 / UNEVEN**2
     if accepted:
         own = torch.cat([e.precision() for e in accepted])
         prior[len(prior) - len(own) :] = own
@@ -251,12 +252,12 @@ def _surfel_columns(
     extension: Extension,
     spots: Tensor,
     transients: Tensor,
-    tilts: Tensor,
+    towards: Tensor,
     patch: Tensor,
 ) -> Tensor:
-    """``[B·T_gate, P]`` derivatives of the expected counts by all surfels' parameters."""
+    """``[B·T_gate, P]`` derivatives of the expected counts by all that the scene may do."""
     jacobian = _record_jacobian(model, extension, spots, transients)
-    return torch.bmm(jacobian, _transient_columns(model, extension, spots, tilts, patch)).flatten(0, 1)
+    return torch.bmm(jacobian, _transient_columns(model, extension, spots, towards, patch)).flatten(0, 1)
 
 
 @torch.no_grad()
@@ -275,44 +276,38 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 
 @torch.no_grad()
 def _transient_columns(
-    model: SurfelModel, extension: Extension, spots: Tensor, tilts: Tensor, patch: Tensor
+    model: SurfelModel, extension: Extension, spots: Tensor, towards: Tensor, patch: Tensor
 ) -> Tensor:
-    """``[B, T, 2N + 2F]`` derivatives of the transients.
+    """``[B, T, 2N + P·J]`` derivatives of the transients.
 
-    By albedos (in units of themselves), depths (in bins) and tilts.
+    By albedos (in units of themselves), by depths (in bins), and by how much brighter each of P patches is
+    where each of the J functions ``towards`` ``[B, J]`` of the wall point is 1.
     """
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
-    unit = albedo_unit(albedo)
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)
     seen = model.arriving(model.visible[spots])[:, :, None] if len(model.visible) else 1.0
 
-    def place(rho: Tensor, depth: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        leaning = torch.nn.functional.normalize(normal + a[:, None] * across + b[:, None] * along, dim=1)
+    def place(rho: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction
-        paths = trace(moved, leaning, model.cell, offsets, *walls, model.confocal)
+        paths = trace(moved, normal, model.cell, offsets, *walls, model.confocal)
         paths = paths._replace(contribution=paths.contribution * seen)
         energy = extension.path(paths.contribution * rho[:, None], paths, spots)
         return energy, model.arrival(extension.time(paths.length, paths, spots))
 
-    across, along = tilt_frame(normal)
     zero, one = torch.zeros_like(albedo), torch.ones_like(albedo)
-    start = (albedo, zero, zero, zero)
-    blocks = []
-    for k, direction in enumerate((unit, one, one, one)):
-        step = tuple(direction if i == k else zero for i in range(4))
-        both = torch.func.jvp(place, start, step)
-        (energy, time), (d_energy, d_time) = both[0], both[1]
-        first, weights = spline_weights(time)
-        values = d_energy[..., None] * weights
-        if k:
-            values = values + (energy * d_time)[..., None] * spline_slopes(time)
-        if k < 2:
-            blocks.append(_scatter_columns(values, first, model.n_bins, patch))
-        else:
-            every = torch.arange(len(model))
-            blocks.append(_scatter_columns(values, first, model.n_bins, every) @ tilts)
-    return torch.cat(blocks, 2)
+    at, by_albedo = torch.func.jvp(place, (albedo, zero), (albedo_unit(albedo), zero))[:2]
+    by_depth = torch.func.jvp(place, (albedo, zero), (zero, one))[1]
+    (energy, time), brighter, (d_energy, d_time) = at, by_albedo[0], by_depth
+    first, weights = spline_weights(time)
+    farther = d_energy[..., None] * weights + (energy * d_time)[..., None] * spline_slopes(time)
+    blocks = [
+        _scatter_columns(values, first, model.n_bins, patch)
+        for values in (brighter[..., None] * weights, farther)
+    ]
+    light = _scatter_columns(energy[..., None] * weights, first, model.n_bins, patches_of(model, PATCHES))
+    uneven = light[..., None] * towards[:, None, None, :]
+    return torch.cat([*blocks, uneven.flatten(2)], 2)
 
 
 def _scatter_columns(values: Tensor, first: Tensor, n_bins: int, column: Tensor) -> Tensor:
@@ -356,15 +351,21 @@ def patches_of(model: SurfelModel, most: int) -> Tensor:
     return patch
 
 
-def tilt_fields(model: SurfelModel) -> Tensor:
-    """``[M, F]`` which patch each surfel lies in, of ``TILTED`` at most whose normals lean together."""
-    return torch.nn.functional.one_hot(patches_of(model, TILTED)).to(model.centre().dtype)
+def towards_wall(model: SurfelModel) -> Tensor:
+    """``[S, J]`` linear and quadratic functions of every spot's wall point, of mean 0 and mean square 1.
 
-
-def tilt_frame(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Two directions ``[M, 3]`` in which each normal may lean, the first as nearly along x as it can be."""
-    across = torch.nn.functional.normalize(torch.tensor([1.0, 0.0, 0.0]) - normal[:, :1] * normal, dim=1)
-    return across, torch.linalg.cross(normal, across)
+    Five of each of laser and sensor point that moves.
+    """
+    points = [p[:, :2] for p in (model.sensor, model.laser) if float((p - p[:1]).abs().max()) > 0]
+    if len(points) == 2 and torch.equal(*points):
+        points = points[:1]
+    found = []
+    for p in points:
+        x, y = (p - p.mean(0)).unbind(1)
+        found += [x, y, x * x, x * y, y * y]
+    functions = torch.stack(found, 1)
+    functions = functions - functions.mean(0)
+    return functions / functions.square().mean(0).sqrt().clamp_min(1e-12)
 
 
 def albedo_unit(albedo: Tensor) -> Tensor:

@@ -26,12 +26,12 @@ from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.criticise import copy_effects
 from nlos_lit.inference.evidence import Projector
 from nlos_lit.inference.problem import (
-    TILT_PRIOR,
+    UNEVEN,
     acting_order,
     build_problem,
     effect_columns,
     patches_of,
-    tilt_fields,
+    towards_wall,
     weighted_columns,
 )
 from nlos_lit.surfels.model import SurfelModel, inverse_softplus
@@ -85,8 +85,8 @@ def unit(n: int, k: int) -> Tensor:
 @pytest.mark.parametrize("accepted", ACCEPTED)
 @pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
 def test_nuisance_is_the_slope_of_the_render(kind, accepted):
-    """Albedos in units of themselves, depths in bins, tilts of each normal (surfels are few), response,
-    effects accepted before.
+    """Albedos in units of themselves, depths in bins, response, effects accepted before; how bright each
+    surfel (they are few) is from where on the wall.
     """
     model, extension, _, spots = setting(kind, accepted)
     m = len(model)
@@ -94,11 +94,6 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     problem = build_problem(model, extension, spots, counts)
     albedo = model.albedo().detach()
     size = torch.maximum(albedo, 0.05 * albedo.mean())
-    normal = model.normal().detach()
-    # Leaning x: the direction along the surfel that is nearest to x; y: perpendicular to both.
-    across = torch.tensor([1.0, 0, 0]) - normal[:, :1] * normal
-    across = across / across.norm(dim=1, keepdim=True)
-    lean = (across, torch.linalg.cross(normal, across))
     changes: list[Callable] = []
     for k in range(m):
         changes.append(
@@ -106,11 +101,6 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
         )
     for k in range(m):
         changes.append(lambda mo, ex, h, k=k: mo.raw_depth.add_(h * unit(m, k)))
-    for direction in lean:
-        for k in range(m):
-            changes.append(
-                lambda mo, ex, h, k=k, d=direction: mo.raw_normal.copy_(normal + h * unit(m, k)[:, None] * d)
-            )
     for name in ("sigma_ls", "kappa_s", "intensity", "background"):
         changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
     changes.append(lambda mo, ex, h: mo.raw_passing.add_(h))
@@ -119,9 +109,16 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
             changes.append(lambda mo, ex, h, k=k, p=p: getattr(ex.effects[k], f"raw_{p}").add_(h))
     expected = model.expected(spots, extension)
     ours = problem.nuisance * expected.reshape(-1, 1).sqrt()
+    # A surfel that is brighter by f at a spot changes that spot as much as one whose albedo is.
+    towards = towards_wall(model)[spots]
+    j = towards.shape[1]
+    uneven = ours[:, 2 * m : (2 + j) * m].reshape(4, 58, m, j)
+    everywhere = (ours[:, :m] * albedo / size).view(4, 58, m, 1)
+    assert torch.allclose(uneven, everywhere * towards[:, None, None, :], rtol=1e-9)
+    ours = torch.cat([ours[:, : 2 * m], ours[:, (2 + j) * m :]], 1)
     assert ours.shape == (4 * 58, len(changes))
     for k, change in enumerate(changes):
-        rounded = k >= 4 * m
+        rounded = k >= 2 * m
         numeric = slope(model, extension, spots, change, ROUGH if rounded else FINE)
         assert float(numeric.abs().max()) > 0, f"column {k} is nothing"
         tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
@@ -129,34 +126,24 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     assert torch.allclose(problem.residual, ((counts - expected) / expected.sqrt()).reshape(-1))
     free = build_problem(model, extension, spots, counts, with_effects=False)
     parameters = sum(e.declared[p].size for e in extension.effects for p in e.declared)
-    assert free.nuisance.shape[1] == len(changes) - parameters
+    assert free.nuisance.shape[1] == len(changes) + j * m - parameters
     assert torch.equal(free.nuisance, problem.nuisance[:, : free.nuisance.shape[1]])
 
 
-def test_normals_of_a_patch_lean_together():
-    """56 surfels are 32 patches, near ones together, each with the prior of a fifth of a radian."""
-    model, extension, _, spots = setting("confocal", number=56)
-    fields = tilt_fields(model)
-    f, m = fields.shape[1], len(model)
-    assert f == 32
-    assert torch.equal(fields.sum(1), torch.ones(m))
-    assert set(fields.sum(0).tolist()) == {1.0, 2.0}
-    problem = build_problem(model, extension, spots, torch.zeros(4, 58))
-    lean = torch.zeros(2 * m + 2 * f + 5)
-    lean[2 * m : 2 * m + 2 * f] = 1 / TILT_PRIOR**2
-    assert torch.allclose(problem.prior, lean)
-    normal = model.normal().detach()
-    across = torch.nn.functional.normalize(torch.tensor([1.0, 0, 0]) - normal[:, :1] * normal, dim=1)
-    for k in (1, f - 1):
-        numeric = slope(
-            model,
-            extension,
-            spots,
-            lambda mo, ex, h, k=k: mo.raw_normal.copy_(normal + h * fields[:, k, None] * across),
-            FINE,
-        )
-        ours = problem.nuisance[:, 2 * m + k] * problem.expected.reshape(-1).sqrt()
-        assert float((ours - numeric).abs().max()) < 2e-5 * float(numeric.abs().max())
+def test_patches_look_uneven_from_the_wall():
+    """56 surfels are 32 patches; each may be brighter by a twentieth along five functions of the wall point,
+    of mean 0 and mean square 1 over the scan; along ten where laser and sensor both move.
+    """
+    for kind, number in (("confocal", 5), ("exhaustive", 10)):
+        model, extension, _, spots = setting(kind, number=56)
+        towards, m = towards_wall(model), len(model)
+        assert towards.shape[1] == number
+        assert torch.allclose(towards.mean(0), torch.zeros(number, dtype=towards.dtype), atol=1e-9)
+        assert torch.allclose(towards.square().mean(0), torch.ones(number, dtype=towards.dtype))
+        problem = build_problem(model, extension, spots, torch.zeros(4, 58))
+        uneven = torch.zeros(2 * m + 32 * number + 5)
+        uneven[2 * m : 2 * m + 32 * number] = 1 / UNEVEN**2
+        assert torch.allclose(problem.prior, uneven)
 
 
 def test_batches_of_spots_change_nothing(monkeypatch):
@@ -172,13 +159,12 @@ def test_batches_of_spots_change_nothing(monkeypatch):
 @pytest.mark.parametrize("name", [e.name for e in [*EFFECTS, *FREE]])
 def test_effect_columns_are_the_slope_of_the_render(name):
     """At values away from the null, beside two effects that were accepted before; amplitudes first, then
-    shapes. Changes of the response are worked out as if they were still at their null.
+    shapes.
     """
     model, extension, scan, spots = setting("exhaustive", "gain and pile-up")
     extension = Extension([e for e in extension.effects if e.name != name])
     effect = effect_of(name, scan).double()
-    if not name.startswith("free_response"):  # what acts alike at all spots is differentiated at its null
-        uneven(effect)
+    uneven(effect)
     whole = copy_effects(extension, [effect])
     place = [e.name for e in whole.effects].index(name)
     ours = effect_columns(model, extension, spots, effect, shapes=True)
