@@ -342,6 +342,9 @@ class Loop:
         Args:
             fit: that goes on.
             name: of the step.
+
+        Returns:
+            another fit.
         """
         text = f"refining the scene {name.replace('_', ' ')}"
         return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
