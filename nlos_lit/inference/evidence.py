@@ -12,11 +12,16 @@ is where it is largest (type-II likelihood; M. Tipping, *JMLR* 1, 2001). Scanned
 beforehand, so that the mean of their Bayes factors counts. Coefficients stay within their bounds: one that
 cannot be negative has no evidence where the counts want it to be.
 
+What X may do only so much of has a prior, N(0, 1/p). It is one more row of X, √p in its own column and 0 in
+Z and r: least squares with that row is the posterior mean, and the projections of Z and r keep what they
+would ask of it. (Without that row Z⊥ᵀZ⊥ counts the prior twice.)
+
 A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i, where it
 exceeds that of counts, divides scores and information (the sandwich of P. Huber, 1967, and of K.-Y. Liang and
 S. Zeger, *Biometrika* 73, 1986). It is the larger of two: between wall blocks, and between the parts of each
 block that are early, later and late. The second holds maps over the wall and numbers of single spots to
-account, which could follow any block: what scales a spot's light scales all of it.
+account, which could follow any block: what scales a spot's light scales all of it. A prior's row is a block
+by itself: what several patches of the scene would all have to do counts for a term, what one would, against.
 """
 
 from __future__ import annotations
@@ -36,7 +41,10 @@ VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
 
 
 class Projector:
-    """Takes from any columns what the base can explain by itself."""
+    """Takes from any columns what the base can explain by itself.
+
+    Projected columns have the problem's rows, then one for each nuisance column that has a prior.
+    """
 
     def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
         x = problem.nuisance
@@ -50,13 +58,14 @@ class Projector:
                 gram + torch.diag(problem.prior.double() + ridge * diagonal)
             )
             ridge *= 10
-        self.nuisance = x
+        self.nuisance, self.held = x, problem.prior.nonzero()[:, 0]
+        self.strength = problem.prior[self.held, None].sqrt()
         self.residual = self.off(problem.residual[:, None])[:, 0]
 
     def off(self, columns: Tensor) -> Tensor:
-        """``columns`` ``[N, k]`` without their projection on the nuisance."""
+        """``[N + Q, k]``: ``columns`` ``[N, k]`` without their projection on the nuisance."""
         weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
-        return columns - self.nuisance @ weights
+        return torch.cat([columns - self.nuisance @ weights, -self.strength * weights[self.held]])
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
@@ -135,8 +144,8 @@ def evidence(
 
     Args:
         raw: ``[S, T, k]`` weighted columns.
-        z: the same with the base projected off.
-        residual: ``[S, T]``, projected.
+        z: ``[S·T + Q, k]``, the same with the base projected off.
+        residual: ``[S·T + Q]``, projected.
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
@@ -145,13 +154,17 @@ def evidence(
     Returns:
         what the counts say of it.
     """
-    z = z * deviation.float()
+    z, rows = z * deviation.float(), raw.shape[0] * raw.shape[1]
     cells = block[:, None] * SEGMENTS + torch.arange(SEGMENTS)
-    s = z.new_zeros(SEGMENTS * (int(block.max()) + 1), z.shape[2]).double()
-    f = s.new_zeros(len(s), z.shape[2], z.shape[2])
-    for k, (each, r) in enumerate(segments(z, residual)):
+    last = SEGMENTS * (int(block.max()) + 1)
+    s = z.new_zeros(last, z.shape[1]).double()
+    f = s.new_zeros(last, z.shape[1], z.shape[1])
+    for k, (each, r) in enumerate(segments(z[:rows].view(raw.shape), residual[:rows].view(raw.shape[:2]))):
         s.index_add_(0, cells[:, k], torch.einsum("stk,st->sk", each, r).double())
         f.index_add_(0, cells[:, k], torch.einsum("stk,stl->skl", each, each).double())
+    held = z[rows:].double()
+    s = torch.cat([s, held * residual[rows:, None]])
+    f = torch.cat([f, held[:, :, None] * held[:, None]])
     values, vectors = torch.linalg.eigh(f.sum(0))
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
     if at is not None:
@@ -172,7 +185,7 @@ def evidence(
 
     loud, _, mean = best(torch.ones_like(u), None)
     left = (s - f @ mean) @ vectors
-    blocks = left.view(-1, SEGMENTS, left.shape[1]).sum(1)
+    blocks = torch.cat([left[:last].view(-1, SEGMENTS, left.shape[1]).sum(1), left[last:]])
     scatter = torch.maximum(left.square().sum(0), blocks.square().sum(0)).div(values).clamp_min(1.0)
     share = u.square() / values
     nats, variance, mean = best(scatter, bounds)

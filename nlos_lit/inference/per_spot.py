@@ -49,13 +49,16 @@ def factors(score: Tensor, information: Tensor, width: float, share: float, posi
     Examples:
         >>> factors(torch.tensor([0.0, 4.0]), torch.tensor([1.0, 1.0]), 1.0, 1.0, False)
         tensor([-0.3466,  3.6534])
+        >>> factors(torch.tensor([4.0]), torch.tensor([1.0]), 0.0, 1.0, True)
+        tensor([0.])
     """
     grown = 1 + width**2 * information
     factor = 0.5 * width**2 * score**2 / grown - 0.5 * grown.log()
     if not positive:
         return factor
     factor = factor + math.log(2) + torch.special.log_ndtr(width * score * grown.rsqrt())
-    return torch.logaddexp(torch.tensor(math.log1p(-share), dtype=score.dtype), math.log(share) + factor)
+    part = torch.tensor(share, dtype=score.dtype)
+    return torch.logaddexp(torch.log1p(-part), part.log() + factor)
 
 
 def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[float, float, float]:

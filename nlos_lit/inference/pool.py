@@ -202,11 +202,10 @@ def _evidence(
     block: Tensor,
     at: Tensor | None = None,
 ) -> Evidence:
-    shape = (*problem.expected.shape, -1)
     return evidence(
-        columns.reshape(shape),
-        z.reshape(shape),
-        residual.view(problem.expected.shape),
+        columns.reshape(*problem.expected.shape, -1),
+        z,
+        residual,
         block,
         prior_deviations(effect),
         step_bounds(effect),
@@ -271,7 +270,7 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
         z = weighted_columns(problem, effect)
         worth = 0.0
         if len(shapes) > 1:
-            score, information = (z.T @ projector.residual).double(), (z.T @ z).double()
+            score, information = (z.T @ projector.residual[: len(z)]).double(), (z.T @ z).double()
             floor = 1e-9 * information.diagonal().mean() + 1e-30
             worth = float(score @ torch.linalg.solve(information + floor * torch.eye(len(score)), score))
         ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
@@ -308,7 +307,7 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
 
 def _scores(column: Tensor, projector: Projector, at: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
     """Score and information of each spot's own coefficient ``[S]``, discounted by their scatter, and that."""
-    residual = projector.residual.view_as(column)
+    residual = projector.residual[: column.numel()].view_as(column)
     information = column.square().sum(1).double().clamp_min(1e-30)
     score = (column * residual).sum(1).double()
     scatter = spot_scatter(column, residual)

@@ -49,9 +49,11 @@ class Uncertainty:
         )
         floor = 1e-9 * information.diagonal().mean() * torch.eye(len(information), dtype=torch.float64)
         inverse = torch.linalg.inv(information + floor)
-        by_spot = (z * projector.residual[:, None]).view(len(spots), -1, z.shape[1]).sum(1).double()
+        score = (z * projector.residual[:, None]).double()
+        by_spot = score[: counts.numel()].view(len(spots), -1, z.shape[1]).sum(1)
         names, index = torch.unique(block, return_inverse=True)
-        by_block = torch.zeros(len(names), z.shape[1], dtype=torch.float64).index_add_(0, index, by_spot)
+        by_block = by_spot.new_zeros(len(names), z.shape[1]).index_add_(0, index, by_spot)
+        by_block = torch.cat([by_block, score[counts.numel() :]])  # a prior's row is a block by itself
         robust = inverse @ (by_block.T @ by_block) @ inverse
         grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
         self.covariance = share * inverse * grow[:, None] * grow[None, :]

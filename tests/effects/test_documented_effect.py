@@ -115,10 +115,13 @@ def test_the_example_is_simulated(glow):
 
 @FORWARD_MODE
 def test_the_example_is_found_among_all_effects(glow):
-    """Counts drawn with it, a base without it: nothing else in the pool has as much evidence."""
+    """Counts drawn with it, a base without it: nothing else in the pool has as much evidence.
+
+    It is weak enough that one linear step reaches it.
+    """
     measured = capture_of(raster(8))
     scan, model = Scan.of(measured), surfels(measured, level=3.0)
-    hidden = effect_of(NAME, scan, fraction=0.2, duration=0.3)
+    hidden = effect_of(NAME, scan, fraction=0.05, duration=0.3)
     counts = drawn(model, Extension([hidden]), measured, seed=2)
     spots = torch.arange(measured.n_spots)
     problem = build_problem(model, Extension([]), spots, torch.from_numpy(counts.gated_counts()))

@@ -51,7 +51,9 @@ def test_gains_of_spots():
     vignetting = effect("vignetting", strength=0.3).gain(signal, spots).detach()
     assert vignetting[:, 7] == pytest.approx(3 * torch.exp(-0.3 * (place[spots] ** 2).sum(1)), rel=1e-5)
     drift = effect("power_drift")
-    drift.set("drift", torch.tensor([0.1, -0.2, 0.0, 0.3, 0.05]))
+    values = torch.zeros(drift.declared["drift"].size)
+    values[:5] = torch.tensor([0.1, -0.2, 0.0, 0.3, 0.05])
+    drift.set("drift", values)
     assert drift.gain(signal, spots)[:, 3].detach() == pytest.approx(
         3 * torch.exp(drift.field()[spots]).detach(), rel=1e-5
     )

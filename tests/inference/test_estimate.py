@@ -122,29 +122,30 @@ def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, 
     return fit, spots, block
 
 
-def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Effects' block of the inverse of the whole information matrix; their columns and the residual off the
-    nuisance.
+    nuisance, the rows of its prior below the others; and what the prior lets the counts do.
     """
     problem = build_problem(fit.model, fit.extension, spots, fit.counts, with_effects=False)
     z = torch.cat([weighted_columns(problem, e) for e in fit.extension.effects], 1).double()
-    x = problem.nuisance.double()
-    both = torch.cat([x, z], 1)
+    held = problem.prior > 0
+    below = torch.diag(problem.prior.double().sqrt())[held]
+    x = torch.cat([problem.nuisance.double(), below])
+    own = torch.cat([z, problem.residual.double()[:, None]], 1)
+    own = torch.cat([own, torch.zeros(len(below), 3, dtype=own.dtype)])
+    both = torch.cat([x, own[:, :2]], 1)
     information = both.T @ both
-    information += torch.diag(torch.cat([problem.prior.double(), torch.zeros(2)]))
     inverse = torch.linalg.inv(information)[-2:, -2:]
-    lean = torch.linalg.solve(
-        information[:-2, :-2], x.T @ torch.cat([z, problem.residual.double()[:, None]], 1)
-    )
-    off = torch.cat([z, problem.residual.double()[:, None]], 1) - x @ lean
-    return inverse, off[:, :2], off[:, 2]
+    off = own - x @ torch.linalg.solve(information[:-2, :-2], x.T @ own)
+    may = problem.nuisance[:, held].double() * problem.prior[held].double().rsqrt()
+    return inverse, off[:, :2], off[:, 2], may
 
 
 @FORWARD_MODE
 def test_covariance_is_the_inverse_of_the_whole_information():
     fit, spots, block = accepted_fit(seed=None)
     found = Uncertainty(fit, spots, fit.counts, block)
-    inverse, _, _ = dense(fit, spots)
+    inverse, *_ = dense(fit, spots)
     # Tilts of single surfels are nearly dependent, and products are in single precision.
     assert torch.allclose(found.covariance, inverse, rtol=5e-3)
     estimate = found.parameters(fit.extension.effects[1])["detections"]
@@ -157,10 +158,10 @@ def test_misfit_between_blocks_widens_the_errors():
     """Huber's sandwich on counts whose patches are brighter and darker than the model."""
     fit, spots, block = accepted_fit(factor=0.1)
     found = Uncertainty(fit, spots, fit.counts, block)
-    inverse, z, residual = dense(fit, spots)
-    by_block = torch.stack(
-        [(z * residual[:, None]).view(64, -1, 2)[block == b].sum((0, 1)) for b in range(16)]
-    )
+    inverse, z, residual, _ = dense(fit, spots)
+    score, rows = z * residual[:, None], fit.counts.numel()
+    by_block = [score[:rows].view(64, -1, 2)[block == b].sum((0, 1)) for b in range(16)]
+    by_block = torch.cat([torch.stack(by_block), score[rows:]])
     robust = inverse @ (by_block.T @ by_block) @ inverse
     grown = (robust.diagonal() / inverse.diagonal()).clamp_min(1).sqrt()
     assert float(grown.max()) > 2
@@ -173,16 +174,17 @@ def test_misfit_between_blocks_widens_the_errors():
 
 @FORWARD_MODE
 def test_errors_are_those_of_repeated_measurements():
-    """Two hundred draws: one-step estimates scatter as the reported errors say, around the truth."""
+    """Two hundred draws of the counts, and of what patches of the scene may do: one-step estimates scatter as
+    the reported errors say, around the truth.
+    """
     fit, spots, block = accepted_fit(seed=None)
     found = Uncertainty(fit, spots, fit.counts, block)
-    _, z, _ = dense(fit, spots)
-    expected = fit.counts.double()
-    drawn_counts = np.random.default_rng(1).poisson(expected.numpy(), (200, *expected.shape))
-    residuals = torch.from_numpy((drawn_counts - expected.numpy()) / np.sqrt(expected.numpy())).reshape(
-        200, -1
-    )
-    steps = residuals @ z @ torch.linalg.inv(z.T @ z)
+    inverse, z, _, may = dense(fit, spots)
+    expected, rng = fit.counts.double(), np.random.default_rng(1)
+    drawn_counts = rng.poisson(expected.numpy(), (200, *expected.shape))
+    residuals = torch.from_numpy((drawn_counts - expected.numpy()) / np.sqrt(expected.numpy()))
+    done = torch.from_numpy(rng.standard_normal((200, may.shape[1]))) @ may.T
+    steps = (residuals.reshape(200, -1) + done) @ z[: len(may)] @ inverse
     error = found.covariance.diagonal().sqrt()
     assert torch.all((steps.std(0) / error - 1).abs() < 4 / 400**0.5)
     assert torch.all(steps.mean(0).abs() < 4 * error / 200**0.5)

@@ -56,7 +56,8 @@ def one(
     z = f.sqrt()[:, None, None]
     residual = torch.tensor(scores)[:, None] / f.sqrt()[:, None]
     limits = None if bounds is None else tuple(torch.tensor([b]).double() for b in bounds)
-    return evidence(z, z, residual, torch.arange(len(f)), torch.tensor([deviation]).double(), limits)
+    blocks, unit = torch.arange(len(f)), torch.tensor([deviation]).double()
+    return evidence(z, z.flatten(0, 1), residual.flatten(), blocks, unit, limits)
 
 
 def test_one_coefficient_by_hand():
@@ -92,11 +93,10 @@ def test_several_coefficients_are_a_gaussian_process(monkeypatch):
     z[:, 3] += z[:, 0]
     deviation = torch.tensor([1.0, 3.0, 0.1, 0.5]).double()
     residual = z @ torch.tensor([0.5, -1.0, 0.1, 0.2]) + normal(ROWS, seed=2)
-    shape = (SPOTS, BINS, -1)
     found = evidence(
-        z.view(shape),
-        z.view(shape),
-        residual.view(SPOTS, BINS),
+        z.view(SPOTS, BINS, -1),
+        z,
+        residual,
         torch.zeros(SPOTS, dtype=torch.long),
         deviation,
     )
@@ -190,6 +190,20 @@ def test_a_prior_leaves_part_of_the_column():
     x = torch.full((ROWS, 1), 0.1)
     left = Projector(problem(torch.zeros(ROWS), x, torch.tensor([3.0]))).off(x)
     assert float(left[0]) == pytest.approx(0.1 * 3 / (ROWS * 0.01 + 3), rel=1e-4)
+    assert float(left[ROWS]) == pytest.approx(-(3**0.5) * ROWS * 0.01 / (ROWS * 0.01 + 3), rel=1e-4)
+
+
+def test_a_prior_counts_once():
+    """Against the marginal likelihood of counts with covariance I + XP⁻¹Xᵀ: its score and information."""
+    x, z, r = normal(ROWS, 5, seed=1), normal(ROWS, 2, seed=3), normal(ROWS, seed=2)
+    z += 0.5 * x[:, :2]
+    precision = torch.tensor([0.1, 3.0, 50.0, 400.0, 10.0])
+    projector = Projector(problem(r, x, precision))
+    off = projector.off(z).double()
+    wide = torch.eye(ROWS).double() + (x / precision @ x.T).double()
+    assert torch.allclose(off.T @ off, z.T.double() @ torch.linalg.solve(wide, z.double()), rtol=1e-4)
+    score = z.T.double() @ torch.linalg.solve(wide, r.double())
+    assert torch.allclose(off.T @ projector.residual.double(), score, atol=1e-3)
 
 
 @pytest.mark.parametrize("columns", [1, 4, 6, 7])
@@ -313,11 +327,10 @@ def test_every_shape_that_could_have_been_counts(monkeypatch):
     assert float(alone.effect.value("period").detach()) == pytest.approx(grid[29]["period"])
     whole, z = problem(truth), own_columns(2, 5) * 10 / ROWS**0.5
     projector = Projector(whole)
-    shape = (SPOTS, BINS, -1)
     nats = evidence(
-        z.view(shape),
-        projector.off(z).view(shape),
-        projector.residual.view(SPOTS, BINS),
+        z.view(SPOTS, BINS, -1),
+        projector.off(z),
+        projector.residual,
         BLOCK,
         prior_deviations(alone.effect),
     ).nats
@@ -418,7 +431,7 @@ def test_a_misfit_that_changes_along_time_holds_a_map_to_account():
     whole = 3.0 * torch.tensor([1.0, -1.0, 0.5])[block][:, None].expand(-1, 8)
     early = whole * 4 * (torch.arange(8) < 2)
     unit = torch.ones(3).double()
-    found = [evidence(z, z, r.contiguous(), block, unit) for r in (whole, early)]
+    found = [evidence(z, z.flatten(0, 1), r.flatten(), block, unit) for r in (whole, early)]
     assert (found[0].scatter, found[0].nats) == (1, pytest.approx(found[0].loud))
     assert found[1].loud == pytest.approx(found[0].loud, rel=1e-5)
     assert found[1].scatter > 50
