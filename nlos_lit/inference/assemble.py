@@ -100,9 +100,7 @@ def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Spli
     others = () if found.again is None else found.again.extension.effects
     again = next((e for e in others if e.name == effect.name), None)
     kept = {e.name for e in found.final.extension.effects}
-    weights = {
-        t.name: t.weight for t in turn.trials if t is trial or (t.name in turn.group and t.name not in kept)
-    }
+    weights = {name: w for name, w in turn.group.items() if name == trial.name or name not in kept}
     total = sum(weights.values())
     free = effect if isinstance(effect, Free) else None
     return Accepted(

@@ -51,9 +51,9 @@ class CriticismSettings:
             unknown reasons may look a little like anything.
         rivals: effects with which the fit goes on in a turn, besides the best free term and the best with a
             number for each spot.
-        open_share: weight above which a rival is one that the capture leaves open: the simplest of these is
-            taken, the others are its group. A fine scene without the term must not be open.
-        most_of: share of the best gain from which on an effect goes before a free term.
+        open_share: weight above which the capture leaves something open: that nothing is to be named, in the
+            turn or beside a fine scene; or that an effect's rival is meant.
+        most_of: share of the best gain from which on a simpler term goes before that with the best.
         most: terms that are accepted at most.
         toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
             side by side.
@@ -61,7 +61,7 @@ class CriticismSettings:
 
     spots: int = 1024
     level: float = 0.01
-    share: float = 0.05
+    share: float = 0.02
     rivals: int = 6
     open_share: float = 0.05
     most_of: float = 0.9
@@ -121,21 +121,20 @@ class Turn:
         candidates: the pool, most evidence first.
         needed: nats.
         trials: fits gone on with its leaders and with none, the largest gain first.
-        best: the simplest of those that are open.
-        group: names that the capture cannot tell from it; a free term is none for an effect.
+        best: the simplest of those that gain most; None where nothing is asked for.
+        group: it and what the capture cannot tell from it, by name, with weights. A free term is none for an
+            effect.
         confirmed: what a fine scene left of it; None where there was none.
         accepted: it is in the model from here on.
-        grown: the base was fine already.
     """
 
     candidates: list[Candidate]
     needed: float
     trials: list[Trial] = field(default_factory=list)
     best: Trial | None = None
-    group: list[str] = field(default_factory=list)
+    group: dict[str, float] = field(default_factory=dict)
     confirmed: Confirmed | None = None
     accepted: bool = False
-    grown: bool = False
 
 
 @dataclass
@@ -287,12 +286,12 @@ class Loop:
 
         Args:
             fit: with the terms accepted so far.
-            fine: the fine scene with these terms, perhaps the same.
+            fine: the fine scene with these terms.
 
         Returns:
             the turn, not confirmed yet; its ``best`` is None where nothing is asked for.
         """
-        s, grown, self.number = self.settings, fit is fine, self.number + 1
+        s, self.number = self.settings, self.number + 1
         self.steps.plan(screen=1, fit=s.rivals + 5)
         asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed)
         candidates = self.steps(
@@ -301,18 +300,14 @@ class Loop:
         bar = needed(candidates, s, self._misfit(fine))
         rivals = leaders(candidates, bar, s.rivals)
         if not rivals:
-            return Turn(candidates, bar, grown=grown)
+            return Turn(candidates, bar)
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
-        left = left_open(trials, s.open_share, s.most_of)
-        best = min(left, key=cost)
-        if best.candidate is None:
-            return Turn(candidates, bar, trials, grown=grown)
-        group = [
-            t.name for t in left if t is not best and (t.name in FREE_NAMES) == (best.name in FREE_NAMES)
-        ]
-        return Turn(candidates, bar, trials, best, group, grown=grown)
+        best = chosen(trials, s)
+        if best is None:
+            return Turn(candidates, bar, trials)
+        return Turn(candidates, bar, trials, best, group_of(best, trials, self.block, s.open_share))
 
     def confirm(self, turn: Turn, fine: SurfelFit, without: SurfelFit) -> Turn:
         """Is the turn's best term still asked for beside a fine scene?
@@ -457,31 +452,45 @@ def leaders(candidates: list[Candidate], bar: float, number: int) -> list[Candid
     return sorted(tried, key=lambda c: -c.evidence)
 
 
-def left_open(trials: list[Trial], least: float, most_of: float) -> list[Trial]:
-    """Those that may be the best of their turn.
+def chosen(trials: list[Trial], s: CriticismSettings) -> Trial | None:
+    """The simplest of those that gain most.
 
     Args:
         trials: of one turn, with weights, the largest gain first.
-        least: weight above which a trial is open.
-        most_of: where a free term gains most, an effect with this share of its gain is open, too; what it
-            leaves is asked for in the next turn.
+        s: settings.
 
     Returns:
-        the first, and all others that are open.
+        None where going on with none is open. Else, of all terms with most of the best one's gain, an effect
+        before a free term and few coefficients before many; what it leaves is asked for in the next turn.
     """
-    enough = most_of * trials[0].gain.nats if trials[0].name in FREE_NAMES else math.inf
-    return [
-        t
-        for t in trials
-        if t is trials[0] or t.weight > least or (t.name not in FREE_NAMES and t.gain.nats > enough)
-    ]
+    terms = [t for t in trials if t.candidate is not None]
+    if any(t.candidate is None and t.weight > s.open_share for t in trials):
+        return None
+    return min((t for t in terms if t.gain.nats >= s.most_of * terms[0].gain.nats), key=cost)
 
 
-def cost(trial: Trial) -> tuple[int, int, float]:
-    """Sort key, the simplest first: none, an effect, a free term; of two of a kind fewer coefficients."""
-    if trial.candidate is None:
-        return 0, 0, 0.0
-    return 1 + (trial.name in FREE_NAMES), len(trial.candidate.step), -trial.weight
+def cost(trial: Trial) -> tuple[bool, int, float]:
+    """Sort key of a term: an effect before a free term, fewer coefficients before more, more gain first."""
+    assert trial.candidate is not None
+    return trial.name in FREE_NAMES, len(trial.candidate.step), -trial.gain.nats
+
+
+def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) -> dict[str, float]:
+    """What the capture cannot tell from the best, among those of its kind: effects, or free terms.
+
+    Args:
+        best: of the turn.
+        trials: of the turn.
+        block: ``[S]`` wall block of each select spot.
+        least: weight above which it cannot.
+
+    Returns:
+        weights by name, the best's first.
+    """
+    kind = [t for t in trials if t.candidate and (t.name in FREE_NAMES) == (best.name in FREE_NAMES)]
+    shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
+    left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
+    return {name: weight / sum(left.values()) for name, weight in left.items()}
 
 
 def criticise(
@@ -510,28 +519,15 @@ def criticise(
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
     first = fine = loop.fine(base, "without_effects")
-    coarse, turns, grown = base, [], False
+    coarse, turns = base, []
     while len(coarse.extension.effects) < s.most:
-        turn = loop.turn(fine if grown else coarse, fine)
-        if turn.best is None:
-            turns.append(turn)
-            if grown:
-                break
-            grown = True
-            continue
-        if grown:
-            with_it, without = turn.best.fit, next(t.fit for t in turn.trials if t.candidate is None)
-        else:
-            with_it, without = loop.again(turn.best), fine
-            coarse_with = with_it
-            with_it = loop.fine(with_it, f"with_{turn.best.name}_{loop.number}")
-        turn = loop.confirm(turn, with_it, without)
+        turn = loop.turn(coarse, fine)
+        if turn.best is not None:
+            again = loop.again(turn.best)
+            refined = loop.fine(again, f"with_{turn.best.name}_{loop.number}")
+            turn = loop.confirm(turn, refined, fine)
         turns.append(turn)
-        if turn.accepted:
-            fine = with_it
-            coarse = with_it if grown else coarse_with
-        elif grown:
+        if not turn.accepted:
             break
-        else:
-            grown = True
+        coarse, fine = again, refined
     return Findings(first, fine, turns, loop.losses(fine), coarse if fine is not first else None)

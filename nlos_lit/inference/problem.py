@@ -31,7 +31,7 @@ from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_w
 from nlos_lit.surfels.model import SurfelModel
 
 PATCHES = 32  # of the scene, each of which looks a little brighter from some wall points than from others …
-UNEVEN = 0.05  # … by so much (rms over the wall): normals, relief and hidden sides are not known better
+UNEVEN = 0.1  # … by so much (rms over the wall): normals, relief and hidden sides are not known better
 CHUNK = 1 << 25  # elements of a batch's columns
 
 
