@@ -61,7 +61,7 @@ class CriticismSettings:
 
     spots: int = 1024
     level: float = 0.01
-    share: float = 0.02
+    share: float = 0.05
     rivals: int = 6
     open_share: float = 0.05
     most_of: float = 0.9
@@ -315,7 +315,7 @@ class Loop:
         Args:
             turn: with a best term.
             fine: the fine scene with it.
-            without: the fine scene that grew without it.
+            without: the fine scene without it.
 
         Returns:
             the turn, accepted or not.
@@ -344,17 +344,40 @@ class Loop:
         text = f"refining the scene {name.replace('_', ' ')}"
         return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
 
-    def again(self, best: Trial) -> SurfelFit:
-        """The parsimonious scene built anew with a trial's term, where that predicts better than the trial's:
-        surfels that imitated the term do not come back.
+    def again(self, trial: Trial) -> SurfelFit:
+        """The parsimonious scene built anew with a trial's terms, where that predicts better: surfels that
+        imitated a term do not come back.
         """
-        name = best.name
-        make = partial(_rebuilt, self.rebuild, best.fit.extension, self.seed)
+        name = trial.name
+        make = partial(_rebuilt, self.rebuild, trial.fit.extension, self.seed)
         other = self.steps("fit", f"rebuilding the scene with {name}", f"turn{self.number}_new_{name}", make)
         if other is None:
-            return best.fit
+            return trial.fit
         value = log_likelihood(other, self.split.select)
-        return other if float(value.sum()) > float(best.likelihood.sum()) else best.fit
+        return other if float(value.sum()) > float(trial.likelihood.sum()) else trial.fit
+
+    def fair(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> SurfelFit:
+        """The fine scene without a turn's best term, with the chance that the term had: other seeds alone may
+        find a better one.
+
+        Args:
+            turn: with a best term.
+            with_it: the scene that was chosen for it.
+            fine: the fine scene without it.
+
+        Returns:
+            the better of two where the term's was built anew, else ``fine``.
+        """
+        assert turn.best is not None
+        if with_it is turn.best.fit:
+            return fine
+        none = next(t for t in turn.trials if t.candidate is None)
+        scene = self.again(none)
+        if scene is none.fit:
+            return fine
+        other = self.fine(scene, f"without_{turn.best.name}_{self.number}")
+        before, after = (log_likelihood(f, self.split.select).sum() for f in (fine, other))
+        return other if after > before else fine
 
     def _misfit(self, fit: SurfelFit) -> float:
         """Of the spots that the pool is asked on."""
@@ -525,7 +548,7 @@ def criticise(
         if turn.best is not None:
             again = loop.again(turn.best)
             refined = loop.fine(again, f"with_{turn.best.name}_{loop.number}")
-            turn = loop.confirm(turn, refined, fine)
+            turn = loop.confirm(turn, refined, loop.fair(turn, again, fine))
         turns.append(turn)
         if not turn.accepted:
             break

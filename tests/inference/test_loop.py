@@ -23,11 +23,11 @@ from nlos_lit.inference.criticise import (
     Trial,
     Turn,
     begun_with,
+    chosen,
     copy_effects,
-    cost,
     criticise,
+    group_of,
     leaders,
-    left_open,
     misfit_of,
     needed,
     weighed,
@@ -62,11 +62,11 @@ class FakeFit:
     tested, train, counts = torch.tensor([0]), torch.tensor([0]), torch.tensor([[1.0]])
     model = SimpleNamespace(expected=lambda rows, extension: torch.tensor([[1.0]]))
 
-    def __init__(self, extension: Extension, seed: int = 0, fine: bool = False, warm: bool = False) -> None:
-        self.extension, self.seed, self.fine, self.warm = extension, seed, fine, warm
+    def __init__(self, extension: Extension, seed: int = 0, fine: bool = False, anew: bool = False) -> None:
+        self.extension, self.seed, self.fine, self.anew = extension, seed, fine, anew
 
     def copy(self, extension: Extension, seed: int) -> FakeFit:
-        return FakeFit(extension, seed, self.fine, warm=True)
+        return FakeFit(extension, seed, self.fine)
 
     def run(self, *_: object, **__: object) -> None:
         pass
@@ -84,8 +84,8 @@ class World:
     """Fits that are worth what a table says.
 
     Args:
-        table: nats of the select spots by names of effects; "fine" counts for a fine scene on top, and a sum
-            of names in alphabetical order may have an entry of its own.
+        table: nats of the select spots by names of effects; "fine" counts for a fine scene on top, "anew" for
+            one from new seeds, and a sum of names in this order may have an entry of its own.
         pool: all that is ever found.
         own: evidence of terms beside a fine scene; that of the pool where nothing is said.
         impossible: effects with which no surfel survives a rebuild.
@@ -113,7 +113,7 @@ class World:
 
     def likelihood(self, fit: FakeFit, spots: np.ndarray) -> Tensor:
         assert np.array_equal(spots, SPLIT.select)
-        names = [*["fine"] * fit.fine, *["new"] * (not fit.warm and not fit.fine), *sorted(fit.names)]
+        names = [*["fine"] * fit.fine, *["anew"] * fit.anew, *sorted(fit.names)]
         if "+".join(names) in self.table:
             return self.table["+".join(names)]
         return sum((self.table[n] for n in names if n in self.table), NOTHING)
@@ -128,7 +128,7 @@ class World:
         return self.own.get(name, next(c.evidence for c in self.pool if c.name == name))
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
-        fit = FakeFit(extension, seed)
+        fit = FakeFit(extension, seed, anew=True)
         self.rebuilt.append((fit.names, seed))
         if fit.names & set(self.impossible):
             raise UserError("no surface")
@@ -136,14 +136,13 @@ class World:
 
     def grow(self, fit: FakeFit, seed: int) -> FakeFit:
         self.grown.append(fit.names)
-        return FakeFit(fit.extension, seed, fine=True)
+        return FakeFit(fit.extension, seed, fine=True, anew=fit.anew)
 
     def loop(self, steps: Steps | None = None, s: CriticismSettings = SETTINGS) -> Loop:
         return Loop(self.rebuild, self.grow, SPLIT, SCAN, s, 4, steps or Steps())
 
-    def turn(self, grown: bool = False) -> Turn:
-        fine = fitted(fine=True)
-        return self.loop().turn(fine if grown else fitted(), fine)
+    def turn(self) -> Turn:
+        return self.loop().turn(fitted(), fitted(fine=True))
 
     def confirm(self, name: str) -> Turn:
         """The pool's turn, and its term beside a fine scene."""
@@ -231,38 +230,29 @@ def test_too_long_a_step_is_shortened(truth, begun):
     assert begun_with(fit, [tail]).effects[0].value("fraction").item() == pytest.approx(begun)
 
 
-def weighing(name: str, weight: float, nats: float = 1.0) -> Trial:
-    return replace(trial(name, NOTHING + nats / 120), weight=weight)
+def gained(name: str, nats: float) -> Trial:
+    return trial(name, NOTHING + nats / 120)
 
 
-def choose(trials: list[Trial]) -> Trial:
-    return min(left_open(trials, 0.05, 0.9), key=cost)
+def test_the_simplest_of_the_terms_that_gain_most():
+    """Nine tenths of the best gain are enough for fewer coefficients, and for an effect beside a free term."""
 
+    def name(*trials: Trial) -> str:
+        return chosen(sorted(trials, key=lambda t: -t.gain.nats), SETTINGS).name
 
-def test_the_simplest_of_those_that_are_left_open():
-    """Fewer coefficients win above the weight; an effect wins over a free term with fewer; none over all."""
-    wide, free = weighing("wall_reflectance", 0.9), weighing("free_rate", 0.9)
+    wide, free = gained("wall_reflectance", 100.0), gained("free_rate", 100.0)
     assert len(wide.candidate.step) > len(free.candidate.step) > 1
-    near, far = weighing("vignetting", 0.051), weighing("vignetting", 0.049)
-    assert choose([wide, near]) is near
-    assert choose([wide, far]) is wide
-    assert choose([free, wide]) is wide
-    # A number a spot is as many coefficients as there are spots.
-    jitter = weighing("timing_jitter", 0.5)
-    assert len(jitter.candidate.step) == 12 > len(wide.candidate.step)
-    assert choose([jitter, wide, far]) is wide
-    none = Trial(None, None, NOTHING, compare(NOTHING, NOTHING, BLOCK), 0.051)
-    assert choose([wide, near, none]) is none
-    assert choose([wide, near, replace(none, weight=0.049)]) is near
+    assert name(wide, gained("vignetting", 90.1)) == "vignetting"
+    assert name(wide, gained("vignetting", 89.9)) == "wall_reflectance"
+    assert name(free, gained("wall_reflectance", 90.1)) == "wall_reflectance"
+    assert name(free, gained("wall_reflectance", 89.9)) == "free_rate"
 
 
-@pytest.mark.parametrize(("share", "name"), [(0.89, "free_rate"), (0.91, "irf_tail")])
-def test_an_effect_with_most_of_a_free_terms_gain_goes_before_it(share, name):
-    """Whatever its weight: what it leaves is asked for in the next turn. Between effects weights decide."""
-    free, tail = weighing("free_rate", 1.0, 100.0), weighing("irf_tail", 0.0, 100 * share)
-    assert choose([free, tail]).name == name
-    law = weighing("wall_reflectance", 1.0, 100.0)
-    assert choose([law, tail]) is law
+@pytest.mark.parametrize(("weight", "name"), [(0.051, None), (0.049, "irf_tail")])
+def test_nothing_is_chosen_where_none_is_open(weight, name):
+    none = Trial(None, None, NOTHING, compare(NOTHING, NOTHING, BLOCK), weight)
+    best = chosen([gained("irf_tail", 100.0), none], SETTINGS)
+    assert (best and best.name) == name
 
 
 def test_trials_stand_by_gain_with_their_weights():
@@ -280,13 +270,12 @@ def test_nothing_is_tried_where_nothing_is_asked_for(monkeypatch):
         assert [t.name for t in found.trials] == (["none", "irf_tail"] if above else [])
 
 
-@pytest.mark.parametrize("grown", [False, True])
-def test_what_gains_is_chosen_and_what_gains_nothing_is_not(monkeypatch, grown):
+def test_what_gains_is_chosen_and_what_gains_nothing_is_not(monkeypatch):
     """A gain of one error leaves none open, which is the simplest; one of four does not."""
     for errors, name in ((1.0, None), (4.0, "irf_tail")):
         gain = gaining(errors, scatter=1.0)
-        found = World(monkeypatch, {"irf_tail": gain}, [candidate("irf_tail")]).turn(grown)
-        assert (found.best and found.best.name, found.grown) == (name, grown)
+        found = World(monkeypatch, {"irf_tail": gain}, [candidate("irf_tail")]).turn()
+        assert (found.best and found.best.name) == name
         assert sum(t.weight for t in found.trials) == pytest.approx(1)
 
 
@@ -308,14 +297,20 @@ def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
     table = {"irf_tail": best, "pile_up": near, "vignetting": best - per_spot(1.0, 0.1, seed=2)}
     found = World(monkeypatch, table, [candidate(n) for n in table]).turn()
     names = {"irf_tail", "pile_up"}
-    assert found.best.name in names
-    assert found.group == list(names - {found.best.name})
-    # A free term that does the same is no other name, an effect that reaches nine tenths of it is.
+    assert next(iter(found.group)) == found.best.name
+    assert found.group.keys() == names
+    assert sum(found.group.values()) == pytest.approx(1)
+    # A free term that does the same is no other name; weights are among effects, however much more it gains.
     table = {"free_rate": best, "irf_tail": 0.95 * best, "afterpulsing": 0.95 * best}
     found = World(monkeypatch, table, [candidate(n) for n in table]).turn()
-    names = {"irf_tail", "afterpulsing"}
-    assert found.best.name in names
-    assert found.group == list(names - {found.best.name})
+    assert found.group == {n: pytest.approx(0.5) for n in ("irf_tail", "afterpulsing")}
+
+
+@pytest.mark.parametrize(("nats", "names"), [(2.5, {"irf_tail", "pile_up"}), (3.5, {"irf_tail"})])
+def test_the_edge_of_a_group(nats, names):
+    """Where all patches say the same, a weight of a twentieth is 2.94 nats."""
+    trials = [gained("irf_tail", 100.0), gained("pile_up", 100.0 - nats)]
+    assert group_of(trials[0], trials, BLOCK, 0.05).keys() == names
 
 
 def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
@@ -335,46 +330,46 @@ def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
 
 
 def test_a_term_that_stands_for_a_finer_scene_is_refused(monkeypatch):
-    """It gains as the scene is coarse, and nothing more when it is not; the pool is asked once more there."""
+    """It gains as the scene is coarse, and nothing more when it is not."""
     table = {"irf_tail": gaining(20.0)}
     world = World(monkeypatch, table, [candidate("irf_tail", 200.0)], own={"irf_tail": 1.0})
     found = world.criticise()
-    assert [(t.best.name, t.accepted, t.grown) for t in found.turns] == [
-        ("irf_tail", False, False),
-        ("irf_tail", False, True),
-    ]
-    assert world.asked == [False, True]
+    assert [(t.best.name, t.accepted) for t in found.turns] == [("irf_tail", False)]
+    assert world.asked == [False]
     assert (found.accepted, found.losses, found.again) == ([], {}, None)
     assert found.final is found.base
     assert (found.base.names, found.base.fine) == (set(), True)
-
-
-def test_what_only_a_fine_scene_shows_is_found_there(monkeypatch):
-    """In the fine scene itself: nothing is rebuilt, and nothing grows again."""
-    world = World(monkeypatch, {"irf_tail": gaining(20.0)}, [candidate("irf_tail", 200.0)])
-    ask = world.ask
-    monkeypatch.setattr(loop, "ask", lambda fit, *_: ask(fit) if fit.fine else [candidate("pile_up", 0.0)])
-    found = world.criticise()
-    assert [t.accepted for t in found.turns] == [False, True, False]
-    assert found.final.names == {"irf_tail"}
-    assert (world.rebuilt, world.grown) == ([], [set()])
 
 
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
     """The one that was gone on with, or one from new seeds, where surfels that imitated the term do not come
     back; none where no surfel survives.
     """
-    for new, impossible, chosen in (
+    for new, impossible, taken in (
         (gaining(1.0), (), True),
         (-gaining(1.0), (), False),
         (gaining(1.0), ("irf_tail",), False),
     ):
-        table = {"irf_tail": gaining(20.0), "new": new}
+        table = {"irf_tail": gaining(20.0), "anew": new}
         world = World(monkeypatch, table, [candidate("irf_tail", 200.0)], impossible=impossible)
         best = world.turn().best
         again = world.loop().again(best)
         assert world.rebuilt == [({"irf_tail"}, 4)]
-        assert (again is not best.fit) is chosen
+        assert (again is not best.fit) is taken
+
+
+@pytest.mark.parametrize(("without", "accepted"), [(0.0, True), (10.0, False)])
+def test_other_seeds_are_tried_without_the_term_where_they_were_with_it(monkeypatch, without, accepted):
+    """With the term a scene that is built anew is better by ten nats when it is fine. If it is without the
+    term, too, that is no merit of the term's.
+    """
+    table = {"irf_tail": gaining(20.0), "anew": NOTHING + 0.1}
+    table |= {"fine+anew+irf_tail": NOTHING + 10 / 120, "fine+anew": NOTHING + without / 120}
+    world = World(monkeypatch, table, [candidate("irf_tail", 200.0)])
+    turn = world.criticise().turns[0]
+    assert world.rebuilt[:2] == [({"irf_tail"}, 4), (set(), 4)]
+    assert turn.accepted is accepted
+    assert turn.confirmed.gain.nats == pytest.approx(10 - without)
 
 
 def test_the_loop_takes_one_term_after_the_other(monkeypatch):
@@ -387,7 +382,7 @@ def test_the_loop_takes_one_term_after_the_other(monkeypatch):
     }
     world = World(monkeypatch, table, pool)
     found = world.criticise()
-    assert [t.best and t.best.name for t in found.turns] == ["irf_tail", "pile_up", "vignetting", None, None]
+    assert [t.best and t.best.name for t in found.turns] == ["irf_tail", "pile_up", "vignetting", None]
     assert found.final.names == {"irf_tail", "pile_up", "vignetting"}
     assert [t.best.name for t in found.accepted] == ["irf_tail", "pile_up", "vignetting"]
     assert list(found.losses) == [e.name for e in found.final.extension.effects]
@@ -402,5 +397,5 @@ def test_the_loop_takes_one_term_after_the_other(monkeypatch):
 def test_a_loop_that_finds_nothing(monkeypatch):
     found = World(monkeypatch, {}, [candidate("irf_tail", 0.0)]).criticise()
     assert isinstance(found, Findings)
-    assert (found.accepted, found.again, len(found.turns), found.losses) == ([], None, 2, {})
+    assert (found.accepted, found.again, len(found.turns), found.losses) == ([], None, 1, {})
     assert found.base is found.final
