@@ -26,7 +26,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, ask, own_evidence, tested_rows
+from nlos_lit.inference.pool import Candidate, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -53,7 +53,8 @@ class CriticismSettings:
             number for each spot.
         open_share: weight above which the capture leaves something open: that nothing is to be named, in the
             turn or beside a fine scene; or that an effect's rival is meant.
-        most_of: share of the best gain from which on a simpler term goes before that with the best.
+        most_of: share of the best gain from which on a simpler term goes before that with the best …
+        odds: … as it does if its weight is this much of the best's.
         most: terms that are accepted at most.
         toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
             side by side.
@@ -65,6 +66,7 @@ class CriticismSettings:
     rivals: int = 6
     open_share: float = 0.05
     most_of: float = 0.9
+    odds: float = 0.25
     most: int = 5
     toys: int = 0
     processes: int = 2
@@ -176,18 +178,19 @@ def needed(candidates: list[Candidate], s: CriticismSettings, misfit: float) -> 
     return math.log(len(candidates) / s.level) + s.share * misfit
 
 
-def misfit_of(fit: SurfelFit, spots: np.ndarray) -> float:
-    """How much likelier than by the fit the counts would be if all but counting noise were explained.
+def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
+    """How much likelier than by the fit counts would be if all but counting noise were explained.
 
     Args:
         fit: that is judged.
-        spots: ``[S]`` rows of the capture that it was fitted to.
+        spots: ``[S]`` rows of the capture that it was not fitted to: of the others it takes up the noise.
+        number: of spots that it is said for.
 
     Returns:
         nats, half the deviance above the noise's; 0 where there is none.
     """
     found = score(fit, spots)
-    return max(0.0, 0.5 * (found.deviance_per_bin - found.deviance_noise) * len(spots) * fit.counts.shape[1])
+    return max(0.0, 0.5 * (found.deviance_per_bin - found.deviance_noise) * number * fit.counts.shape[1])
 
 
 def begun_with(fit: SurfelFit, extra: list[Candidate]) -> Extension:
@@ -323,13 +326,41 @@ class Loop:
         assert turn.best is not None
         s, name = self.settings, turn.best.name
         own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
-        nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}", own)
+        tried = "" if turn.confirmed is None else "_again"
+        nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}{tried}", own)
         before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
         bar = needed(turn.candidates, s, self._misfit(fine))
         weight = weights([before, after], self.block)[1]
         found = Confirmed(nats, bar, compare(before, after, self.block), weight)
         yes = nats > bar and weight > 1 - s.open_share
         return replace(turn, confirmed=found, accepted=yes)
+
+    def beside(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> tuple[SurfelFit, SurfelFit]:
+        """The fine scene without a turn's best term goes on with it, and without: whatever seeds do to a
+        scene they do to both. A scene that has taken up the term gains nothing so: this is asked second.
+
+        Args:
+            turn: with a best term.
+            with_it: a fine scene with it.
+            fine: the fine scene without it.
+
+        Returns:
+            with it and without.
+        """
+        assert turn.best is not None
+        name = turn.best.name
+        effect = next(e for e in with_it.extension.effects if e.name == name)
+        found = [
+            self.steps("fit", f"going on beside the fine scene, {text}", f"turn{self.number}_{text}", make)
+            for text, make in (
+                (
+                    f"with {name}",
+                    lambda: self._go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
+                ),
+                (f"without {name}", lambda: self._warm(fine, [])),
+            )
+        ]
+        return found[0], found[1]
 
     def fine(self, fit: SurfelFit, name: str) -> SurfelFit:
         """The scene as fine as the counts ask for, with the fit's terms.
@@ -380,9 +411,8 @@ class Loop:
         return other if after > before else fine
 
     def _misfit(self, fit: SurfelFit) -> float:
-        """Of the spots that the pool is asked on."""
-        rows = tested_rows(fit, self.split, self.settings.spots, self.seed)
-        return misfit_of(fit, self.split.fit[rows])
+        """For as many spots as the pool is asked on."""
+        return misfit_of(fit, self.split.select, min(len(self.split.fit), self.settings.spots))
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""
@@ -483,13 +513,17 @@ def chosen(trials: list[Trial], s: CriticismSettings) -> Trial | None:
         s: settings.
 
     Returns:
-        None where going on with none is open. Else, of all terms with most of the best one's gain, an effect
-        before a free term and few coefficients before many; what it leaves is asked for in the next turn.
+        None where going on with none is open. Else, of all terms with most of the best one's gain or much of
+        its weight, an effect before a free term and few coefficients before many; what it leaves is asked for
+        in the next turn.
     """
-    terms = [t for t in trials if t.candidate is not None]
+    first, *others = [t for t in trials if t.candidate is not None]
     if any(t.candidate is None and t.weight > s.open_share for t in trials):
         return None
-    return min((t for t in terms if t.gain.nats >= s.most_of * terms[0].gain.nats), key=cost)
+    near = [
+        t for t in others if t.gain.nats >= s.most_of * first.gain.nats or t.weight >= s.odds * first.weight
+    ]
+    return min([first, *near], key=cost)
 
 
 def cost(trial: Trial) -> tuple[bool, int, float]:
@@ -549,6 +583,10 @@ def criticise(
             again = loop.again(turn.best)
             refined = loop.fine(again, f"with_{turn.best.name}_{loop.number}")
             turn = loop.confirm(turn, refined, loop.fair(turn, again, fine))
+            found = turn.confirmed
+            if found is not None and not turn.accepted and found.evidence > found.needed:
+                refined, without = loop.beside(turn, refined, fine)
+                turn = loop.confirm(turn, refined, without)
         turns.append(turn)
         if not turn.accepted:
             break
