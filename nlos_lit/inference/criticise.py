@@ -183,7 +183,7 @@ def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
 
     Args:
         fit: that is judged.
-        spots: ``[S]`` rows of the capture that it was not fitted to: of the others it takes up the noise.
+        spots: ``[S]`` rows of the capture.
         number: of spots that it is said for.
 
     Returns:
@@ -300,7 +300,7 @@ class Loop:
         candidates = self.steps(
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
-        bar = needed(candidates, s, self._misfit(fine))
+        bar = needed(candidates, s, self._misfit(fine, self.split.fit))
         rivals = leaders(candidates, bar, s.rivals)
         if not rivals:
             return Turn(candidates, bar)
@@ -329,7 +329,7 @@ class Loop:
         tried = "" if turn.confirmed is None else "_again"
         nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}{tried}", own)
         before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
-        bar = needed(turn.candidates, s, self._misfit(fine))
+        bar = needed(turn.candidates, s, self._misfit(fine, self.split.select))
         weight = weights([before, after], self.block)[1]
         found = Confirmed(nats, bar, compare(before, after, self.block), weight)
         yes = nats > bar and weight > 1 - s.open_share
@@ -410,9 +410,13 @@ class Loop:
         before, after = (log_likelihood(f, self.split.select).sum() for f in (fine, other))
         return other if after > before else fine
 
-    def _misfit(self, fit: SurfelFit) -> float:
-        """For as many spots as the pool is asked on."""
-        return misfit_of(fit, self.split.select, min(len(self.split.fit), self.settings.spots))
+    def _misfit(self, fit: SurfelFit, spots: np.ndarray) -> float:
+        """By some spots, for as many as the pool is asked on.
+
+        What is tried is asked by the fitted ones, of which surfels take up noise: before it is in the model, a
+        term is part of the misfit itself. What is accepted is asked by the others.
+        """
+        return misfit_of(fit, spots, min(len(self.split.fit), self.settings.spots))
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""
