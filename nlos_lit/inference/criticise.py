@@ -413,8 +413,8 @@ class Loop:
     def _misfit(self, fit: SurfelFit, spots: np.ndarray) -> float:
         """By some spots, for as many as the pool is asked on.
 
-        What is tried is asked by the fitted ones, of which surfels take up noise: before it is in the model, a
-        term is part of the misfit itself. What is accepted is asked by the others.
+        To be tried, by the fitted ones, of which surfels take up noise: before it is in the model, a term is
+        part of the misfit itself. To be accepted, by the others.
         """
         return misfit_of(fit, spots, min(len(self.split.fit), self.settings.spots))
 
