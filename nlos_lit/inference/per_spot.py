@@ -33,18 +33,20 @@ def sparse(effect: Effect) -> bool:
     return effect.amplitudes[0].lower == effect.amplitudes[0].null
 
 
-def factors(score: Tensor, information: Tensor, width: float, share: float, positive: bool) -> Tensor:
+def factors(
+    score: Tensor, information: Tensor, width: float | Tensor, share: float, positive: bool
+) -> Tensor:
     """Log marginal likelihood ratio of each spot against no effect, see the module's equation.
 
     Args:
         score: ``[S]`` of the spot's own coefficient at 0.
         information: ``[S]`` of it, > 0.
-        width: σ of the coefficients.
+        width: σ of the coefficients, or ``[W, 1]`` of them.
         share: π of the spots that have one.
         positive: coefficients are half normal and sparse.
 
     Returns:
-        ``[S]`` nats.
+        ``[S]`` nats, or ``[W, S]``.
 
     Examples:
         >>> factors(torch.tensor([0.0, 4.0]), torch.tensor([1.0, 1.0]), 1.0, 1.0, False)
@@ -74,11 +76,11 @@ def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[floa
     """
     typical = float(information.median().clamp_min(1e-30).rsqrt())
     best = (0.0, 0.0, 1.0)
-    for k in torch.arange(-6, 13, 0.5).tolist():
-        for share in SHARES if positive else (1.0,):
-            width = typical * 2.0**k
-            gain = float(factors(score, information, width, share, positive).sum())
-            best = max(best, (gain, width, share))
+    widths = typical * 2.0 ** torch.arange(-6, 13, 0.5, dtype=score.dtype)
+    for share in SHARES if positive else (1.0,):
+        gains = factors(score, information, widths[:, None], share, positive).sum(1)
+        k = int(gains.argmax())
+        best = max(best, (float(gains[k]), float(widths[k]), share))
     if best[0] == 0.0:
         return best
 
