@@ -89,7 +89,7 @@ class World:
         pool: all that is ever found.
         own: evidence of terms beside a fine scene; that of the pool where nothing is said.
         impossible: effects with which no surfel survives a rebuild.
-        misfit: nats that every fine scene leaves.
+        misfit: nats that every fine scene leaves. taken_up: of the fitted spots, fewer.
     """
 
     def __init__(
@@ -100,6 +100,7 @@ class World:
         own: dict[str, float] | None = None,
         impossible: tuple[str, ...] = (),
         misfit: float = 0.0,
+        taken_up: float = 0.0,
     ) -> None:
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
         self.rebuilt: list[tuple[frozenset[str], int]] = []
@@ -108,7 +109,8 @@ class World:
         monkeypatch.setattr(loop, "log_likelihood", self.likelihood)
         monkeypatch.setattr(loop, "ask", self.ask)
         monkeypatch.setattr(loop, "own_evidence", self.own_evidence)
-        monkeypatch.setattr(loop, "misfit_of", lambda *_: misfit)
+        by = {len(SPLIT.select): misfit, len(SPLIT.fit): misfit - taken_up}
+        monkeypatch.setattr(loop, "misfit_of", lambda fit, spots, number: by[len(spots)] * (number == 300))
 
     def likelihood(self, fit: FakeFit, spots: np.ndarray) -> Tensor:
         assert np.array_equal(spots, SPLIT.select)
@@ -329,6 +331,19 @@ def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
     for without, accepted in ((-fine, True), (fine, False)):
         table = {"irf_tail": tail, "fine+irf_tail": NOTHING, "fine": without}
         found = World(monkeypatch, table, [candidate("irf_tail", 200.0)]).confirm("irf_tail")
+        assert found.accepted is accepted
+
+
+def test_spots_that_were_not_fitted_say_what_is_accepted(monkeypatch):
+    """Of 1000 nats a scene has taken up 900 of the fitted spots: 2 nats are asked before trials, on top of
+    ln(1/level), and 20 at the end.
+    """
+    for evidence, accepted in ((24.5, False), (24.7, True)):
+        pool = [candidate("irf_tail", evidence)]
+        world = World(monkeypatch, {"irf_tail": gaining(20.0)}, pool, misfit=1000.0, taken_up=900.0)
+        found = world.confirm("irf_tail")
+        assert found.needed == pytest.approx(math.log(100) + 2)
+        assert found.confirmed.needed == pytest.approx(math.log(100) + 20)
         assert found.accepted is accepted
 
 
