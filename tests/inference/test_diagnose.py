@@ -80,7 +80,7 @@ def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     assert evidence == sorted(evidence, reverse=True)
     misfit = (said["needed"] - np.log(len(evidence) / 0.01)) / CriticismSettings.share
     assert 0 <= misfit < 1000, "nats that the fine scene leaves"
-    assert said["chance"] == pytest.approx(min(1, len(evidence) * np.exp(-evidence[0])))
+    assert said["chance"] == pytest.approx(min(1, 0.01 * np.exp(said["needed"] - evidence[0])))
     assert said["effects"] == [], "nothing is hidden in the scene"
     assert said["unknown"] == []
     assert set(said["unexplained"]) == {"significant", "axis", "evidence"}
