@@ -184,7 +184,7 @@ def test_what_is_planted_is_asked_for_first(name):
 NAMED = {
     "power_drift": ({"drift": 0.05}, "free_scan"),
     "wall_reflectance": ({"gain_map": 0.2}, "free_wall"),  # more than patches may look uneven
-    "time_drift": ({"drift": 0.1 * BIN}, "free_scan_delay"),
+    "time_drift": ({"drift": 0.055 * BIN}, "free_scan_delay"),
     "ambient_map": ({"level_map": 0.2}, "free_wall_background"),
     "irf_tail": ({"fraction": 0.1}, "free_time"),
     "background_slope": ({"slope": 0.3}, "free_time"),
