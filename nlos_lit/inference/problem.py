@@ -5,8 +5,8 @@ Rows are gated bins of the looked-at spots, divided by √μ, so that counts of 
 variance.
 
 - ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, how bright each
-  patch of the scene is from where on the wall, the laser-sensor response, what passes the sheets in front,
-  and the parameters of effects that were accepted before.
+  patch of the scene is from where on the wall and where it lies along x and y, the laser-sensor response,
+  what passes the sheets in front, and the parameters of effects that were accepted before.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
@@ -95,7 +95,7 @@ def build_problem(
     m, first = len(model), model.gate[0]
     towards, patch = towards_wall(model), patches_of(model, patches or m)
     n_patches = int(patch.max()) + 1
-    size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))
+    size = max(1, CHUNK // (model.n_bins * (3 * m + 8 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
@@ -278,36 +278,45 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 def _transient_columns(
     model: SurfelModel, extension: Extension, spots: Tensor, towards: Tensor, patch: Tensor
 ) -> Tensor:
-    """``[B, T, 2N + P·J]`` derivatives of the transients.
+    """``[B, T, 2N + P·(J + 2)]`` derivatives of the transients.
 
-    By albedos (in units of themselves), by depths (in bins), and by how much brighter each of P patches is
-    where each of the J functions ``towards`` ``[B, J]`` of the wall point is 1.
+    By albedos (in units of themselves), by depths (in bins), by how much brighter each of P patches is where
+    each of the J functions ``towards`` ``[B, J]`` of the wall point is 1, and by its moves along x and y (in
+    bins).
     """
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)
     seen = model.arriving(model.visible[spots])[:, :, None] if len(model.visible) else 1.0
 
-    def place(rho: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
+    def place(rho: Tensor, depth: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
         moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction
+        moved = moved + torch.nn.functional.pad(side * model.bin_length / 2, (0, 1))
         paths = trace(moved, normal, model.cell, offsets, *walls, model.confocal)
         paths = paths._replace(contribution=paths.contribution * seen)
         energy = extension.path(paths.contribution * rho[:, None], paths, spots)
         return energy, model.arrival(extension.time(paths.length, paths, spots))
 
-    zero, one = torch.zeros_like(albedo), torch.ones_like(albedo)
-    at, by_albedo = torch.func.jvp(place, (albedo, zero), (albedo_unit(albedo), zero))[:2]
-    by_depth = torch.func.jvp(place, (albedo, zero), (zero, one))[1]
-    (energy, time), brighter, (d_energy, d_time) = at, by_albedo[0], by_depth
+    zero, one, still = torch.zeros_like(albedo), torch.ones_like(albedo), torch.zeros_like(centre[:, :2])
+    here, coarse = (albedo, zero, still), patches_of(model, PATCHES)
+    (energy, time), (brighter, _) = torch.func.jvp(place, here, (albedo_unit(albedo), zero, still))
     first, weights = spline_weights(time)
-    farther = d_energy[..., None] * weights + (energy * d_time)[..., None] * spline_slopes(time)
+    slopes = spline_slopes(time)
+
+    def moving(*tangent: Tensor) -> Tensor:
+        d_energy, d_time = torch.func.jvp(place, here, tangent)[1]
+        return d_energy[..., None] * weights + (energy * d_time)[..., None] * slopes
+
     blocks = [
         _scatter_columns(values, first, model.n_bins, patch)
-        for values in (brighter[..., None] * weights, farther)
+        for values in (brighter[..., None] * weights, moving(zero, one, still))
     ]
-    light = _scatter_columns(energy[..., None] * weights, first, model.n_bins, patches_of(model, PATCHES))
-    uneven = light[..., None] * towards[:, None, None, :]
-    return torch.cat([*blocks, uneven.flatten(2)], 2)
+    light = _scatter_columns(energy[..., None] * weights, first, model.n_bins, coarse)
+    blocks.append((light[..., None] * towards[:, None, None, :]).flatten(2))
+    for axis in torch.eye(2).to(still):
+        values = moving(zero, zero, axis.expand_as(still))
+        blocks.append(_scatter_columns(values, first, model.n_bins, coarse))
+    return torch.cat(blocks, 2)
 
 
 def _scatter_columns(values: Tensor, first: Tensor, n_bins: int, column: Tensor) -> Tensor:

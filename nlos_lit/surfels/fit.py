@@ -48,8 +48,8 @@ class SurfelSettings:
         more: last rounds that may follow, in some of which surfels are divided, see
             :meth:`SurfelFit.schedule`.
         batch: spots a step.
-        depth_rate: of Adam, in bins there and back. albedo_rate, response_rate: of the unconstrained values.
-        effect_rate: of physical effects, in their own noticeable steps.
+        depth_rate: of Adam, in bins there and back. side_rate: in cells. albedo_rate, response_rate: of the
+            unconstrained values. effect_rate: of physical effects, in their own noticeable steps.
         bending: weight of :meth:`SurfelModel.bending`; 1 takes it for the logarithm of a prior.
         evenness: weight of :meth:`SurfelModel.albedo_steps`.
         brightness: weight of :meth:`SurfelModel.brightness`.
@@ -72,6 +72,7 @@ class SurfelSettings:
     more: int = 4
     batch: int = 24
     depth_rate: float = 0.15
+    side_rate: float = 0.05
     albedo_rate: float = 0.08
     response_rate: float = 0.03
     effect_rate: float = 0.1
@@ -446,6 +447,7 @@ class SurfelFit:
         response = [] if self.plan[0].contest else [*model.laser_sensor.parameters(), model.raw_passing]
         groups = [
             {"params": settled, "lr": s.depth_rate},
+            {"params": [] if self.plan[0].contest else [model.raw_side], "lr": s.side_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
             {"params": response, "lr": response_rate},
             {"params": list(self.extension.parameters()), "lr": s.effect_rate},
@@ -479,7 +481,7 @@ class SurfelFit:
 
         Returns:
             ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``evenness``,
-            ``brightness``, ``effects``.
+            ``brightness``, ``sideways``, ``effects``.
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
@@ -489,6 +491,7 @@ class SurfelFit:
             "bending": s.bending * per_count * model.bending(),
             "evenness": s.evenness * per_count * model.albedo_steps(),
             "brightness": s.brightness * per_count * model.brightness(),
+            "sideways": per_count * model.sideways(),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
         return {"loss": sum(terms.values(), torch.zeros(())), **terms}

@@ -37,6 +37,7 @@ from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
 OPAQUE = 0.6  # of the mean albedo: fainter surfels may be false, and hide nothing
+SIDE = 0.29  # cells: deviation of a place that is anywhere in a cell, 1/√12
 
 
 class Lateral(NamedTuple):
@@ -51,8 +52,9 @@ class SurfelModel(nn.Module):
     """Surfels with place, normal and albedo, and the laser-sensor response.
 
     Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for
-    that. "Depth" is the place along it. State dicts are complete: :meth:`from_state` rebuilds the model with
-    its number of surfels.
+    that. "Depth" is the place along it. Besides, it moves sideways in its own plane, since at an outline, or
+    where albedo changes, the middle of a cell's light is not the cell's own. State dicts are complete:
+    :meth:`from_state` rebuilds the model with its number of surfels.
 
     Args:
         capture: for its wall points and time axis; its counts are not kept.
@@ -68,6 +70,7 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
+        axes: ``[M, 2, 3]`` m, a cell's sides in the surfel's own plane.
         visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
         observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
         pairs: neighbours on one sheet, see :meth:`link`.
@@ -81,6 +84,7 @@ class SurfelModel(nn.Module):
     cell: Tensor
     anchor: Tensor
     direction: Tensor
+    axes: Tensor
     visible: Tensor
     observed: Tensor
     pairs: tuple[Tensor, Tensor]
@@ -131,10 +135,12 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
+        self.register_buffer("axes", spread(normal, self.cell.to(normal), torch.eye(2).to(normal))[0])
         self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
         self.raw_shift = nn.Parameter(torch.zeros(len(centre), device=device))  # neighbours come along
+        self.raw_side = nn.Parameter(torch.zeros(len(centre), 2, device=device))  # cells
         self.raw_normal = nn.Parameter(normal)
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
@@ -158,7 +164,8 @@ class SurfelModel(nn.Module):
         """``[M, 3]`` m."""
         together = 0 if self.sheet is None else carry_along(self.sheet, self.raw_shift)
         depth = self.raw_depth + together
-        return self.anchor + (depth * (self.bin_length / 2))[:, None] * self.direction
+        sideways = (self.raw_side[..., None] * self.axes).sum(1)
+        return self.anchor + (depth * (self.bin_length / 2))[:, None] * self.direction + sideways
 
     def normal(self) -> Tensor:
         """``[M, 3]`` unit, towards the wall's side."""
@@ -202,7 +209,7 @@ class SurfelModel(nn.Module):
         centre, normal = self.placed()
         self.raw_normal.copy_(normal)
         self.anchor.copy_(centre)
-        for moved in (self.raw_depth, self.raw_shift):
+        for moved in (self.raw_depth, self.raw_shift, self.raw_side):
             moved.zero_()
         self.sheet = None
 
@@ -222,6 +229,10 @@ class SurfelModel(nn.Module):
     def brightness(self) -> Tensor:
         """How far albedos exceed the scene's own level, see the function of the same name."""
         return brightness(self.albedo())
+
+    def sideways(self) -> Tensor:
+        """How far surfels lie from where the round began, ``½ Σ (cells/SIDE)²``."""
+        return 0.5 * (self.raw_side / SIDE).square().sum()
 
     @torch.no_grad()
     def update_visibility(self) -> None:

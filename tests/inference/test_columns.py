@@ -85,8 +85,8 @@ def unit(n: int, k: int) -> Tensor:
 @pytest.mark.parametrize("accepted", ACCEPTED)
 @pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
 def test_nuisance_is_the_slope_of_the_render(kind, accepted):
-    """Albedos in units of themselves, depths in bins, response, effects accepted before; how bright each
-    surfel (they are few) is from where on the wall.
+    """Albedos in units of themselves, depths and places along x and y in bins, response, effects accepted
+    before; how bright each surfel (they are few) is from where on the wall.
     """
     model, extension, _, spots = setting(kind, accepted)
     m = len(model)
@@ -101,6 +101,9 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
         )
     for k in range(m):
         changes.append(lambda mo, ex, h, k=k: mo.raw_depth.add_(h * unit(m, k)))
+    for axis in (0, 1):
+        for k in range(m):
+            changes.append(lambda mo, ex, h, k=k, a=axis: mo.anchor[k, a].add_(h * mo.bin_length / 2))
     for name in ("sigma_ls", "kappa_s", "intensity", "background"):
         changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
     changes.append(lambda mo, ex, h: mo.raw_passing.add_(h))
@@ -118,7 +121,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     ours = torch.cat([ours[:, : 2 * m], ours[:, (2 + j) * m :]], 1)
     assert ours.shape == (4 * 58, len(changes))
     for k, change in enumerate(changes):
-        rounded = k >= 2 * m
+        rounded = k >= 4 * m
         numeric = slope(model, extension, spots, change, ROUGH if rounded else FINE)
         assert float(numeric.abs().max()) > 0, f"column {k} is nothing"
         tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
@@ -141,7 +144,7 @@ def test_patches_look_uneven_from_the_wall():
         assert torch.allclose(towards.mean(0), torch.zeros(number, dtype=towards.dtype), atol=1e-9)
         assert torch.allclose(towards.square().mean(0), torch.ones(number, dtype=towards.dtype))
         problem = build_problem(model, extension, spots, torch.zeros(4, 58))
-        uneven = torch.zeros(2 * m + 32 * number + 5)
+        uneven = torch.zeros(2 * m + 32 * (number + 2) + 5)
         uneven[2 * m : 2 * m + 32 * number] = 1 / UNEVEN**2
         assert torch.allclose(problem.prior, uneven)
 
