@@ -48,8 +48,9 @@ class SurfelSettings:
         more: last rounds that may follow, in some of which surfels are divided, see
             :meth:`SurfelFit.schedule`.
         batch: spots a step.
-        depth_rate: of Adam, in bins there and back. side_rate: in cells. albedo_rate, response_rate: of the
-            unconstrained values. effect_rate: of physical effects, in their own noticeable steps.
+        depth_rate: of Adam, in bins there and back. side_rate: in cells, of places in the surfel's own plane;
+            0 leaves them in the middle of their cells. albedo_rate, response_rate: of the unconstrained
+            values. effect_rate: of physical effects, in their own noticeable steps.
         bending: weight of :meth:`SurfelModel.bending`; 1 takes it for the logarithm of a prior.
         evenness: weight of :meth:`SurfelModel.albedo_steps`.
         brightness: weight of :meth:`SurfelModel.brightness`.
@@ -72,7 +73,7 @@ class SurfelSettings:
     more: int = 4
     batch: int = 24
     depth_rate: float = 0.15
-    side_rate: float = 0.05
+    side_rate: float = 0.0
     albedo_rate: float = 0.08
     response_rate: float = 0.03
     effect_rate: float = 0.1
@@ -86,7 +87,9 @@ class SurfelSettings:
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
             raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
-        least = min(self.contest, self.bending, self.evenness, self.brightness, self.surfel_cost)
+        least = min(
+            self.contest, self.side_rate, self.bending, self.evenness, self.brightness, self.surfel_cost
+        )
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
                 "surfels.floor must lie between 0 and 1, and surfels.contest, bending, evenness, brightness "
@@ -447,7 +450,7 @@ class SurfelFit:
         response = [] if self.plan[0].contest else [*model.laser_sensor.parameters(), model.raw_passing]
         groups = [
             {"params": settled, "lr": s.depth_rate},
-            {"params": [] if self.plan[0].contest else [model.raw_side], "lr": s.side_rate},
+            {"params": [model.raw_side] if settled and s.side_rate else [], "lr": s.side_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
             {"params": response, "lr": response_rate},
             {"params": list(self.extension.parameters()), "lr": s.effect_rate},
