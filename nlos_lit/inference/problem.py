@@ -299,7 +299,8 @@ def _transient_columns(
 
     zero, one, still = torch.zeros_like(albedo), torch.ones_like(albedo), torch.zeros_like(centre[:, :2])
     here, coarse = (albedo, zero, still), patches_of(model, PATCHES)
-    (energy, time), (brighter, _) = torch.func.jvp(place, here, (albedo_unit(albedo), zero, still))
+    at, by_albedo = torch.func.jvp(place, here, (albedo_unit(albedo), zero, still))[:2]
+    (energy, time), brighter = at, by_albedo[0]
     first, weights = spline_weights(time)
     slopes = spline_slopes(time)
 

@@ -45,6 +45,7 @@ def test_nothing_hidden_nothing_named():
     assert outcome.ratio < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.xfail(
     reason="nothing was named: the base is 16 % above noise, and refining it gains more (docs/criticism.md)",
     strict=False,
@@ -60,6 +61,7 @@ def test_two_effects_are_both_named_and_measured():
         assert abs(outcome.errors[name][quantity][1]) < within, outcome.found
 
 
+@pytest.mark.slow
 @pytest.mark.xfail(
     reason="said to be unknown from spot to spot instead of along the scan (docs/criticism.md)", strict=False
 )

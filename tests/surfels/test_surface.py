@@ -23,7 +23,7 @@ from nlos_lit.functional.surfel_graph import brightness
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.fit import WORTH, Round, SurfelSettings
-from nlos_lit.surfels.fitted import fit_surfels, score_spots
+from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels, score_spots
 from nlos_lit.surfels.growth import (
     Score,
     Seeds,
@@ -35,7 +35,7 @@ from nlos_lit.surfels.growth import (
     prune_and_grow,
     support,
 )
-from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.model import SIDE, SurfelModel
 
 QUICK = SurfelSettings(contest=40, rounds=3, steps=100, more=0, test_spots=200, floor=0.15, per_cell=2)
 BIN = 0.0096
@@ -423,6 +423,41 @@ def test_a_shift_takes_the_sheet_along(fitted):
     model.lift()
     assert torch.equal(model.centre(), kept)
     assert not model.raw_shift.any()
+
+
+def test_a_side_is_a_way_within_the_surfels_own_plane(fitted):
+    capture, result = fitted[0], fitted[-1]
+    model = flat_sheet(capture, result, tilt=0.5)
+    leaning, cell = model.normal()[4].detach(), model.cell[0].item()
+    before = model.centre().detach()
+    with torch.no_grad():
+        model.raw_side[4] = torch.tensor([SIDE, 0.0])
+    moved = (model.centre() - before)[4]
+    assert abs(torch.dot(moved, leaning).item()) < 1e-6
+    assert moved[:2].norm().item() == pytest.approx(SIDE * cell, rel=1e-4)  # it covers its cell from above
+    assert model.sideways().item() == pytest.approx(0.5)  # one deviation
+    kept = model.centre().detach()
+    model.lift()
+    assert torch.equal(model.centre(), kept)
+    assert model.sideways() == 0
+
+
+def outside(result: FittedSurfels) -> float:
+    """How far the front plate's light lies outside its outline on average, m."""
+    points = result.points()
+    x, y, z = points.positions.T
+    front = z < 0.62
+    beyond = np.hypot((np.abs(x - 0.12) - 0.15 * np.cos(0.25)).clip(0), (np.abs(y - 0.08) - 0.125).clip(0))
+    return np.average(beyond[front], weights=points.albedo[front])
+
+
+def test_surfels_that_move_sideways_come_in_from_beyond_an_outline(fitted):
+    capture, held, intensity, grid, still = fitted
+    settings = dataclasses.replace(QUICK, side_rate=0.05)
+    train = np.flatnonzero(~held)
+    moved = fit_surfels(capture, intensity, grid, settings, train, seed=0, heldout_spots=np.flatnonzero(held))
+    assert outside(moved) < 0.6 * outside(still)
+    assert moved.heldout.deviance_per_bin < still.heldout.deviance_per_bin
 
 
 def test_normals_follow_places_while_a_sheet_is_laid(fitted):
