@@ -75,10 +75,11 @@ def run(set_name: str, first: int, number: int, processes: int) -> None:
 
 
 def keep_rows(set_name: str) -> None:
-    """Replace the rows of a set in the committed file by those that are stored."""
+    """Add the stored rows of a set to the committed file; those of earlier commits stay."""
     old = [json.loads(text) for text in ROWS.read_text().splitlines()] if ROWS.exists() else []
     new = [json.loads(f.read_text()) for f in sorted(STORE.glob(f"{set_name}_*.json"))]
-    kept = [row for row in old if row["set_name"] != set_name] + new
+    again = {(row["set_name"], row["index"], row["commit"]) for row in new}
+    kept = [row for row in old if (row["set_name"], row["index"], row["commit"]) not in again] + new
     ROWS.write_text("".join(json.dumps(row) + "\n" for row in kept))
 
 
@@ -177,8 +178,7 @@ def table(cases: list[dict]) -> str:
     out = ["| what | asked for | measured (95 % interval) |", "|---|---|---|"]
     out += [f"| {what} | {asked} | {value} |" for what, asked, value in rows_of(cases)]
     seconds = sum(c["seconds"] for c in cases)
-    commits = ", ".join(sorted({c["commit"] for c in cases}))
-    out += ["", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each; commit {commits}.", ""]
+    out += ["", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each.", ""]
     heads = (
         "no.",
         "scene",
@@ -210,9 +210,14 @@ def report() -> None:
     cases = [json.loads(text) for text in ROWS.read_text().splitlines()]
     parts = []
     for name in ("test", "validation", "development"):
-        rows = sorted((c for c in cases if c["set_name"] == name), key=lambda c: c["index"])
-        if rows:
-            parts.append(f"## The {name} set\n\n{table(rows)}\n")
+        looks = defaultdict(list)
+        for case in cases:
+            if case["set_name"] == name:
+                looks[case["commit"]].append(case)
+        for when, rows in reversed(looks.items()):
+            rows.sort(key=lambda c: c["index"])
+            span = f"{rows[0]['index']} to {rows[-1]['index']}"
+            parts.append(f"## The {name} set, numbers {span}, at commit {when}\n\n{table(rows)}\n")
     page = ROOT / "docs" / "blind.md"
     head = page.read_text().split(MARK)[0]
     page.write_text(head + MARK + "\n\n" + "\n".join(parts))
