@@ -288,14 +288,18 @@ class _EqualResponse(_FreeResponse):
 
 
 class FreeResponseScan(_FreeResponse):
-    """The response changes over the scan: b_j 16 stretches of it."""
+    """The response changes over the scan: b_j 16 stretches of it, each less its mean over the spots.
+
+    What is the same at all spots is no change: a tail that no single equation follows would pass for one.
+    """
 
     name, axis = "free_response_scan", "time×scan"
     words = _words("along time that changes over the scan", "The response drifts, or comes and goes.")
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return stretches(scan, 16)
+        found = stretches(scan, 16)
+        return found - found.mean(0)
 
 
 class FreeResponseWall(_FreeResponse):
