@@ -93,7 +93,7 @@ def build_problem(
     with torch.no_grad():
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m, first = len(model), model.gate[0]
-    towards, patch = towards_wall(model), patches_of(model, patches or m)
+    towards, patch, coarse = towards_wall(model), patches_of(model, patches or m), patches_of(model, PATCHES)
     n_patches = int(patch.max()) + 1
     size = max(1, CHUNK // (model.n_bins * (3 * m + 8 * PATCHES)))
     surfels, others, light = [], [], []
@@ -101,7 +101,7 @@ def build_problem(
     for part in spots.split(size):
         with torch.no_grad():
             light.append(model.transients(model.paths(part), part, extension))
-        surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch))
+        surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
         if len(model.visible):
@@ -116,7 +116,7 @@ def build_problem(
     nuisance *= weight[:, None]
     residual = (counts - expected).reshape(-1) * weight
     prior = torch.zeros(nuisance.shape[1])
-    uneven = towards.shape[1] * (int(patches_of(model, PATCHES).max()) + 1)
+    uneven = towards.shape[1] * (int(coarse.max()) + 1)
     prior[2 * n_patches : 2 * n_patches + uneven] = 1 / UNEVEN**2
     if accepted:
         own = torch.cat([e.precision() for e in accepted])
@@ -254,10 +254,13 @@ def _surfel_columns(
     transients: Tensor,
     towards: Tensor,
     patch: Tensor,
+    coarse: Tensor,
 ) -> Tensor:
     """``[B·T_gate, P]`` derivatives of the expected counts by all that the scene may do."""
     jacobian = _record_jacobian(model, extension, spots, transients)
-    return torch.bmm(jacobian, _transient_columns(model, extension, spots, towards, patch)).flatten(0, 1)
+    return torch.bmm(jacobian, _transient_columns(model, extension, spots, towards, patch, coarse)).flatten(
+        0, 1
+    )
 
 
 @torch.no_grad()
@@ -276,13 +279,13 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 
 @torch.no_grad()
 def _transient_columns(
-    model: SurfelModel, extension: Extension, spots: Tensor, towards: Tensor, patch: Tensor
+    model: SurfelModel, extension: Extension, spots: Tensor, towards: Tensor, patch: Tensor, coarse: Tensor
 ) -> Tensor:
     """``[B, T, 2N + P·(J + 2)]`` derivatives of the transients.
 
-    By albedos (in units of themselves), by depths (in bins), by how much brighter each of P patches is where
-    each of the J functions ``towards`` ``[B, J]`` of the wall point is 1, and by its moves along x and y (in
-    bins).
+    By albedos (in units of themselves) and depths (in bins) of the N groups ``patch`` ``[M]``, by how much
+    brighter each of the P groups ``coarse`` ``[M]`` is where each of the J functions ``towards`` ``[B, J]``
+    of the wall point is 1, and by its moves along x and y (in bins).
     """
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
@@ -298,7 +301,7 @@ def _transient_columns(
         return energy, model.arrival(extension.time(paths.length, paths, spots))
 
     zero, one, still = torch.zeros_like(albedo), torch.ones_like(albedo), torch.zeros_like(centre[:, :2])
-    here, coarse = (albedo, zero, still), patches_of(model, PATCHES)
+    here = (albedo, zero, still)
     at, by_albedo = torch.func.jvp(place, here, (albedo_unit(albedo), zero, still))[:2]
     (energy, time), brighter = at, by_albedo[0]
     first, weights = spline_weights(time)

@@ -92,8 +92,8 @@ class SurfelSettings:
         )
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
-                "surfels.floor must lie between 0 and 1, and surfels.contest, bending, evenness, brightness "
-                f"and surfel_cost be 0 or more; found floor={self.floor} and {least}"
+                "surfels.floor must lie between 0 and 1, and surfels.contest, side_rate, bending, evenness, "
+                f"brightness and surfel_cost be 0 or more; found floor={self.floor} and {least}"
             )
 
 

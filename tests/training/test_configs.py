@@ -253,7 +253,7 @@ def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, 
     assert set(names("model")) == {"default", "paper", "reference_code", "surface"}
 
 
-def test_the_base_of_a_diagnosis_is_the_surface_of_a_run_but_for_how_finely_it_may_be_divided():
+def test_the_base_of_a_diagnosis_is_the_surface_of_a_run_but_for_how_it_divides_and_moves():
     """tests/blind and these configs speak of the same base."""
     assert composed()["surfels"] == dataclasses.asdict(SurfelSettings())
     assert composed(command="diagnose")["surfels"] == dataclasses.asdict(
