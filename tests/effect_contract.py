@@ -147,6 +147,9 @@ class EffectContract:
             assert "gain" in at_null.hooks
         if at_null.witness == "tail":
             assert at_null.declared["decay"].unit == "m"
+        if at_null.witness == "delay":
+            assert at_null.per_spot
+            assert at_null.declared["offset"].unit == "m"
 
     def test_docstring(self, built: type[Effect]) -> None:
         told = sections(built)

@@ -83,6 +83,8 @@ WITNESS = {
     "tail_decay_fitted_m": 0.117,
     "tail_decay_direct_m": [0.078, 0.111],
     "maps": {"direct": [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]], "fitted": [[0.1, 0.2, 0.28], [0.2, 0.41, None]]},
+    "delay_correlation": 0.594,
+    "delays": {"direct": [-4e-4, 1e-4, 9e-4], "fitted": [-6e-4, -1e-4, 7e-4]},
 }
 
 
@@ -238,6 +240,8 @@ CASES = {
             "tail_decay_fitted_m": None,
             "tail_decay_direct_m": None,
             "maps": None,
+            "delay_correlation": None,
+            "delays": None,
         },
     ),
 }

@@ -30,7 +30,8 @@ class Effect(nn.Module, Hooks):
         split_by: other effects that leave nearly the same trace, and the measurement that would tell. Of a
             pair, one says it.
         witness: what of the direct pulse, which no fit has seen, tells of the effect: its ``energy`` spot by
-            spot (a gain), its ``tail`` (a parameter ``decay``), or nothing.
+            spot (a gain), its ``tail`` (a parameter ``decay``), its ``delay`` spot by spot (a parameter
+            ``offset``), or nothing.
         per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is
             what is reported.
         hooks: those that the class overrides. What follows from them:
@@ -42,7 +43,7 @@ class Effect(nn.Module, Hooks):
     name: ClassVar[str]
     words: ClassVar[EffectWords | None] = None
     split_by: ClassVar[Mapping[str, str]] = {}
-    witness: ClassVar[Literal["energy", "tail"] | None] = None
+    witness: ClassVar[Literal["energy", "tail", "delay"] | None] = None
     per_spot: ClassVar[bool] = False
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""

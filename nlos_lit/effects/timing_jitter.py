@@ -41,6 +41,7 @@ class TimingJitter(Effect):
         "own direct pulse.",
         headline="σ = {sigma}",
     )
+    witness = "delay"
     per_spot = True
 
     @classmethod

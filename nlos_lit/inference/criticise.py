@@ -128,6 +128,7 @@ class Turn:
             effect.
         confirmed: what a fine scene left of it; None where there was none.
         accepted: it is in the model from here on.
+        refused: by name, those that were chosen before it and of which a fine scene left too little.
     """
 
     candidates: list[Candidate]
@@ -137,6 +138,7 @@ class Turn:
     group: dict[str, float] = field(default_factory=dict)
     confirmed: Confirmed | None = None
     accepted: bool = False
+    refused: dict[str, Confirmed] = field(default_factory=dict)
 
 
 @dataclass
@@ -307,10 +309,40 @@ class Loop:
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
-        best = chosen(trials, s)
+        return self._chosen(Turn(candidates, bar, trials), trials)
+
+    def next_best(self, turn: Turn) -> Turn | None:
+        """The turn with what is chosen in place of a term of which a fine scene left too little.
+
+        It is one of those that the pool itself asks for.
+
+        Args:
+            turn: with a best term that was not accepted.
+
+        Returns:
+            the turn, not confirmed yet; None where nothing else is asked for.
+        """
+        assert turn.best is not None
+        assert turn.confirmed is not None
+        refused = {**turn.refused, turn.best.name: turn.confirmed}
+        left = [
+            t
+            for t in turn.trials
+            if t.candidate is None or (t.name not in refused and t.candidate.evidence > turn.needed)
+        ]
+        if len(left) == 1:
+            return None
+        other = self._chosen(Turn(turn.candidates, turn.needed, turn.trials), weighed(left, self.block))
+        if other.best is None:
+            return None
+        self.steps.plan(screen=1, fit=2)
+        return replace(other, refused=refused)
+
+    def _chosen(self, turn: Turn, trials: list[Trial]) -> Turn:
+        best = chosen(trials, self.settings)
         if best is None:
-            return Turn(candidates, bar, trials)
-        return Turn(candidates, bar, trials, best, group_of(best, trials, self.block, s.open_share))
+            return turn
+        return replace(turn, best=best, group=group_of(best, trials, self.block, self.settings.open_share))
 
     def confirm(self, turn: Turn, fine: SurfelFit, without: SurfelFit) -> Turn:
         """Is the turn's best term still asked for beside a fine scene?
@@ -334,6 +366,26 @@ class Loop:
         found = Confirmed(nats, bar, compare(before, after, self.block), weight)
         yes = nats > bar and weight > 1 - s.open_share
         return replace(turn, confirmed=found, accepted=yes)
+
+    def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:
+        """Is the turn's best term still asked for beside a fine scene, in one of two ways?
+
+        Args:
+            turn: with a best term.
+            fine: the fine scene without it.
+
+        Returns:
+            the turn, accepted or not; the parsimonious and the fine scene with the term.
+        """
+        assert turn.best is not None
+        again = self.again(turn.best)
+        refined = self.fine(again, f"with_{turn.best.name}_{self.number}")
+        turn = self.confirm(turn, refined, self.fair(turn, again, fine))
+        found = turn.confirmed
+        if found is not None and not turn.accepted and found.evidence > found.needed:
+            refined, without = self.beside(turn, refined, fine)
+            turn = self.confirm(turn, refined, without)
+        return turn, again, refined
 
     def beside(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> tuple[SurfelFit, SurfelFit]:
         """The fine scene without a turn's best term goes on with it, and without: whatever seeds do to a
@@ -583,14 +635,12 @@ def criticise(
     coarse, turns = base, []
     while len(coarse.extension.effects) < s.most:
         turn = loop.turn(coarse, fine)
-        if turn.best is not None:
-            again = loop.again(turn.best)
-            refined = loop.fine(again, f"with_{turn.best.name}_{loop.number}")
-            turn = loop.confirm(turn, refined, loop.fair(turn, again, fine))
-            found = turn.confirmed
-            if found is not None and not turn.accepted and found.evidence > found.needed:
-                refined, without = loop.beside(turn, refined, fine)
-                turn = loop.confirm(turn, refined, without)
+        while turn.best is not None:
+            turn, again, refined = loop.asked_again(turn, fine)
+            other = None if turn.accepted else loop.next_best(turn)
+            if other is None:
+                break
+            turn = other
         turns.append(turn)
         if not turn.accepted:
             break

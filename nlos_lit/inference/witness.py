@@ -1,6 +1,7 @@
 """The direct pulse (first bounce), outside the gate and seen by no fit: does it agree with what was found?
 
-Its energy at a spot is laser power × wall reflectance × collection, its decay the detector's slow tail.
+Its energy at a spot is laser power × wall reflectance × collection, its decay the detector's slow tail, its
+arrival the spot's own time zero.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from nlos_lit.capture import Capture
 from nlos_lit.effects import EFFECTS
 from nlos_lit.surfels.fit import SurfelFit
 
 LEAST = 20.0  # counts a spot before the gate that make a witness
+NEIGHBOURS = 8  # of a spot, over whose mean a delay that is the spot's own stands
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
@@ -25,8 +28,9 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         fit: to the gate alone.
 
     Returns:
-        Correlation of the fitted gain with the pulse's energy per spot, both tails' decays (m of path) and
-        the maps; None without the pulse.
+        Correlation of the fitted gain with the pulse's energy per spot, both tails' decays (m of path), the
+        maps, and what single spots' delays, fitted and of the pulse, have over their neighbours (m of path)
+        with their correlation; None without the pulse.
     """
     first = capture.gate[0]
     before = capture.counts[:, :first].sum(1, dtype=np.float64)
@@ -38,6 +42,8 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         "tail_decay_fitted_m": None,
         "tail_decay_direct_m": None,
         "maps": None,
+        "delay_correlation": None,
+        "delays": None,
     }
     gain = log_gain(fit, capture.n_spots)
     if gain is not None:
@@ -50,7 +56,54 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         first_acting = min(slow, key=lambda e: EFFECTS.index(type(e)))
         found["tail_decay_fitted_m"] = float(first_acting.value("decay").detach())
         found["tail_decay_direct_m"] = direct_decays(capture)
+    for effect in fit.extension.effects:
+        if effect.witness == "delay":
+            fitted = effect.value("offset").detach().reshape(-1).double().numpy()
+            spots = np.flatnonzero(fitted)  # those of other spots stay at 0
+            places = capture.laser[spots, :2]
+            delays = {
+                "direct": over_neighbours(direct_delays(capture)[spots], places),
+                "fitted": over_neighbours(fitted[spots], places),
+            }
+            found["delay_correlation"] = float(np.corrcoef(delays["direct"], delays["fitted"])[0, 1])
+            found["delays"] = {name: d.tolist() for name, d in delays.items()}
     return found
+
+
+def direct_delays(capture: Capture) -> np.ndarray:
+    """How much later each spot's direct pulse comes than the mean of all, m of path.
+
+    Least squares in the mean pulse and its slope, weighted as counts are: to first order a pulse of any
+    strength that is shifted is the sum of both. So it holds for a small part of the pulse's own width.
+
+    Args:
+        capture: with bins before its gate.
+
+    Returns:
+        ``[S]``.
+    """
+    counts = capture.counts[:, : capture.gate[0]].astype(np.float64)
+    mean = counts.mean(0)
+    columns = np.stack([mean, -np.gradient(mean)], 1)
+    weighted = columns / mean.clip(1e-3 * mean.max())[:, None]
+    strength, shifted = np.linalg.solve(columns.T @ weighted, weighted.T @ counts.T)
+    return capture.bin_length * shifted / strength.clip(1e-9)
+
+
+def over_neighbours(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """What each spot has over the mean of its nearest neighbours.
+
+    What is smooth over the wall is no spot's own.
+
+    Args:
+        values: ``[S]``.
+        places: ``[S, 2]`` on the wall.
+
+    Returns:
+        ``[S]``.
+    """
+    near = cKDTree(places).query(places, NEIGHBOURS + 1)[1][:, 1:]
+    return values - values[near].mean(1)
 
 
 @torch.no_grad()

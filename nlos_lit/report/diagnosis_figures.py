@@ -78,6 +78,8 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         shown["witness_maps"] = witness_maps(witness["maps"], ends, witness.get("wall_gain_correlation"))
     if witness.get("tail_decay_fitted_m") is not None and witness.get("tail_decay_direct_m"):
         shown["witness_tail"] = witness_tail(witness["tail_decay_fitted_m"], witness["tail_decay_direct_m"])
+    if witness.get("delays"):
+        shown["witness_delays"] = witness_delays(**witness["delays"], r=witness["delay_correlation"])
     return shown
 
 
@@ -503,6 +505,34 @@ def witness_tail(fitted: float, direct: Sequence[float]) -> Figure:
     )
     axes.spines["left"].set_visible(False)
     axes.legend(loc="upper left", ncols=2)
+    return figure
+
+
+@styled
+def witness_delays(direct: Sequence[float], fitted: Sequence[float], r: float) -> Figure:
+    """Single spots' delays, of the direct pulse and fitted, one against the other.
+
+    Args:
+        direct: m of path. fitted: too.
+        r: their correlation.
+
+    Returns:
+        One panel.
+    """
+    both = np.stack([direct, fitted])
+    factor, unit = scales_of("time", "m", float(np.abs(both).max()), None)[0]
+    figure = Figure(figsize=(4.2, 3.9))
+    axes = figure.subplots()
+    ends = factor * np.quantile(np.abs(both), 0.999) * np.array([-1, 1])
+    axes.plot(ends, ends, color=ORANGE, linewidth=1)
+    axes.plot(*(factor * both), ".", color=BLUE, markersize=3, alpha=0.5, rasterized=True)
+    axes.set(
+        xlim=ends,
+        ylim=ends,
+        xlabel=f"direct pulse ({unit})",
+        ylabel=f"fitted ({unit})",
+        title=f"correlation {number(r, 2)}",
+    )
     return figure
 
 

@@ -48,6 +48,8 @@ CAPTIONS = {
     "witness_maps": "The direct pulse, which lies outside the gate, against the wall gain that was fitted"
     " inside it.",
     "witness_tail": "The direct pulse's own decay against the tail that was fitted inside the gate.",
+    "witness_delays": "When each spot's direct pulse comes against the delay that was fitted inside the gate,"
+    " both over the mean of the spot's neighbours.",
 }
 SCATTERED = 1.5  # scatter from which on it is said
 FACTS = {
@@ -353,6 +355,9 @@ def _witness(diagnosis: Diagnosis) -> str:
                 " … ".join(amount_of("time", v) for v in direct),
             ]
         )
+    if w.get("delay_correlation") is not None:
+        apart = "Correlation of the spots' fitted delays with its own, each over its neighbours'"
+        rows.append([apart, number(w["delay_correlation"])])
     return "<p>It lies outside the gate; no fit has used it.</p>" + _table(["Witness", "Value"], rows)
 
 

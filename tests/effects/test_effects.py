@@ -101,9 +101,10 @@ def test_effects_act_in_the_order_of_stages():
 
 
 def test_witnesses():
-    said = {kind: {e.name for e in EFFECTS if e.witness == kind} for kind in ("energy", "tail")}
+    said = {kind: {e.name for e in EFFECTS if e.witness == kind} for kind in ("energy", "tail", "delay")}
     assert said["energy"] >= {"wall_reflectance", "power_drift", "vignetting"}
     assert said["tail"] >= {"irf_tail", "afterpulsing"}
+    assert said["delay"] == {"timing_jitter"}
 
 
 def test_an_effect_can_be_added_for_a_while():

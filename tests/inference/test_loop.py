@@ -359,6 +359,26 @@ def test_a_term_that_stands_for_a_finer_scene_is_refused(monkeypatch):
     assert (found.base.names, found.base.fine) == (set(), True)
 
 
+@pytest.mark.parametrize(
+    ("evidence", "own", "names"),
+    [(12.0, 200.0, ["pile_up"]), (12.0, 1.0, []), (10.0, 200.0, [])],
+)
+def test_what_is_next_best_is_asked_in_place_of_what_is_refused(monkeypatch, evidence, own, names):
+    """If the pool asks for it: the bar is 5.3 + 5.3. A term that only its gain speaks for ends the turn."""
+    table = {"irf_tail": gaining(40.0), "pile_up": gaining(20.0, seed=1)}
+    pool = [candidate("irf_tail", 300.0), candidate("pile_up", evidence)]
+    found = World(monkeypatch, table, pool, own={"irf_tail": 1.0, "pile_up": own}, misfit=265.0)
+    turns = found.criticise().turns
+    assert [t.best.name for t in turns if t.accepted] == names
+    first = turns[0]
+    asked = evidence > first.needed
+    assert first.best.name == ("pile_up" if asked else "irf_tail")
+    assert {n: c.evidence for n, c in first.refused.items()} == ({"irf_tail": 1.0} if asked else {})
+    assert "irf_tail" not in first.group or not asked
+    assert found.grown[0] == set()
+    assert {"pile_up"} not in found.grown or asked
+
+
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
     """The one that was gone on with, or one from new seeds, where surfels that imitated the term do not come
     back; none where no surfel survives.

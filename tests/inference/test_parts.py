@@ -22,7 +22,7 @@ from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
-from nlos_lit.inference.witness import direct_decays, log_gain, witness
+from nlos_lit.inference.witness import direct_decays, direct_delays, log_gain, over_neighbours, witness
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
 
@@ -142,6 +142,27 @@ def test_the_witness_knows_the_gain():
     assert witness(pulse_capture(gains=mixed), fit)["wall_gain_correlation"] == pytest.approx(
         by_hand, abs=1e-4
     )
+
+
+def test_the_witness_knows_the_time_zero_of_single_spots():
+    """Pulses of any strength that come up to a fifth of a bin late; a slope over the wall is no jitter."""
+    side = 16
+    rng = np.random.default_rng(0)
+    late, gain = 0.1 * rng.standard_normal(side**2), rng.uniform(0.5, 2.0, side**2)
+    t = np.arange(200) - 30 - late[:, None]
+    counts = np.round(1e6 * gain[:, None] * np.exp(-0.5 * (t / 4) ** 2)) + 5
+    seen = capture_of(raster(side), counts=counts, gate=(160, 200), t_start=0.0)
+    assert direct_delays(seen) == pytest.approx(BIN * (late - late.mean()), abs=0.01 * BIN)
+    places = seen.laser[:, :2]
+    assert over_neighbours(places[:, 0], places).reshape(side, side)[2:-2, 2:-2] == pytest.approx(0, abs=1e-9)
+    for own, r in ((late, 1.0), (np.roll(late, 77), 0.0)):
+        jitter = effect_of("timing_jitter", Scan.of(seen))
+        with torch.no_grad():
+            jitter.raw_offset.copy_(torch.from_numpy(own + places[:, 0]).reshape(jitter.raw_offset.shape))
+        found = witness(seen, SimpleNamespace(extension=Extension([jitter])))
+        assert found["delay_correlation"] == pytest.approx(r, abs=0.01 if r else 4 / side)
+        assert np.std(found["delays"]["fitted"]) == pytest.approx(BIN * 0.1 * (1 + 1 / 8) ** 0.5, rel=0.2)
+    assert witness(seen, SimpleNamespace(extension=Extension([])))["delays"] is None
 
 
 def test_without_a_direct_pulse_there_is_no_witness():
