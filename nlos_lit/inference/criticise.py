@@ -25,7 +25,7 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
-from nlos_lit.inference.per_spot import solve
+from nlos_lit.inference.per_spot import solve, sparse
 from nlos_lit.inference.pool import Candidate, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
@@ -121,7 +121,8 @@ class Turn:
 
     Args:
         candidates: the pool, most evidence first.
-        needed: nats.
+        needed: nats, of a term that a misfit may look like.
+        asked: names of those that have the evidence that they need.
         trials: fits gone on with its leaders and with none, the largest gain first.
         best: the simplest of those that gain most; None where nothing is asked for.
         group: it and what the capture cannot tell from it, by name, with weights. A free term is none for an
@@ -133,6 +134,7 @@ class Turn:
 
     candidates: list[Candidate]
     needed: float
+    asked: frozenset[str] = frozenset()
     trials: list[Trial] = field(default_factory=list)
     best: Trial | None = None
     group: dict[str, float] = field(default_factory=dict)
@@ -166,18 +168,23 @@ class Findings:
         return [t for t in self.turns if t.accepted and t.best is not None and t.best.name in kept]
 
 
-def needed(candidates: list[Candidate], s: CriticismSettings, misfit: float) -> float:
+def needed(
+    candidates: list[Candidate], s: CriticismSettings, misfit: float, effect: Effect | None = None
+) -> float:
     """Nats that a term of this pool needs.
 
     Args:
         candidates: the pool.
         s: settings.
         misfit: nats, see :func:`misfit_of`.
+        effect: the term; None for one that a misfit may look like. What single spots have over their
+            neighbours it does not look like: a scene is seen alike from neighbouring points.
 
     Returns:
-        ln(terms/level) and the settings' share of the misfit.
+        ln(terms/level) and, where the misfit counts, the settings' share of it.
     """
-    return math.log(len(candidates) / s.level) + s.share * misfit
+    own = effect is not None and effect.per_spot and not sparse(effect)
+    return math.log(len(candidates) / s.level) + (0.0 if own else s.share * misfit)
 
 
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
@@ -302,14 +309,17 @@ class Loop:
         candidates = self.steps(
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
-        bar = needed(candidates, s, self._misfit(fine, self.split.fit))
-        rivals = leaders(candidates, bar, s.rivals)
-        if not rivals:
-            return Turn(candidates, bar)
+        misfit = self._misfit(fine, self.split.fit)
+        bars = {c.name: needed(candidates, s, misfit, c.effect) for c in candidates}
+        asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
+        turn = Turn(candidates, needed(candidates, s, misfit), asked)
+        if not any(c.loud > bars[c.name] for c in candidates):
+            return turn
+        rivals = leaders(candidates, s.rivals)
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
-        return self._chosen(Turn(candidates, bar, trials), trials)
+        return self._chosen(replace(turn, trials=trials), trials)
 
     def next_best(self, turn: Turn) -> Turn | None:
         """The turn with what is chosen in place of a term of which a fine scene left too little.
@@ -326,13 +336,12 @@ class Loop:
         assert turn.confirmed is not None
         refused = {**turn.refused, turn.best.name: turn.confirmed}
         left = [
-            t
-            for t in turn.trials
-            if t.candidate is None or (t.name not in refused and t.candidate.evidence > turn.needed)
+            t for t in turn.trials if t.candidate is None or (t.name in turn.asked and t.name not in refused)
         ]
         if len(left) == 1:
             return None
-        other = self._chosen(Turn(turn.candidates, turn.needed, turn.trials), weighed(left, self.block))
+        bare = replace(turn, best=None, group={}, confirmed=None)
+        other = self._chosen(bare, weighed(left, self.block))
         if other.best is None:
             return None
         self.steps.plan(screen=1, fit=2)
@@ -361,7 +370,8 @@ class Loop:
         tried = "" if turn.confirmed is None else "_again"
         nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}{tried}", own)
         before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
-        bar = needed(turn.candidates, s, self._misfit(fine, self.split.select))
+        misfit = self._misfit(fine, self.split.select)
+        bar = needed(turn.candidates, s, misfit, next(e for e in fine.extension.effects if e.name == name))
         weight = weights([before, after], self.block)[1]
         found = Confirmed(nats, bar, compare(before, after, self.block), weight)
         yes = nats > bar and weight > 1 - s.open_share
@@ -534,7 +544,7 @@ def is_law(candidate: Candidate | None) -> bool:
     return candidate is not None and candidate.name not in FREE_NAMES and not candidate.effect.per_spot
 
 
-def leaders(candidates: list[Candidate], bar: float, number: int) -> list[Candidate]:
+def leaders(candidates: list[Candidate], number: int) -> list[Candidate]:
     """Which terms are tried.
 
     Half of the effects have the most evidence; the others would have, were their scatter their own: one
@@ -542,15 +552,12 @@ def leaders(candidates: list[Candidate], bar: float, number: int) -> list[Candid
 
     Args:
         candidates: most evidence first.
-        bar: nats that one of them needs, were its scatter its own; without there are no leaders.
         number: of effects that are the same law at all spots; the best free term and the best with a number
             for each spot come on top.
 
     Returns:
         those, most evidence first.
     """
-    if not any(c.loud > bar for c in candidates):
-        return []
     asked = [c for c in candidates if c.loud > 0]
     laws = [c for c in asked if is_law(c)]
     tried = laws[: number // 2]

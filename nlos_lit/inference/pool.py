@@ -16,7 +16,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.evidence import SEGMENTS, Evidence, Projector, evidence, prior_deviations, step_bounds
-from nlos_lit.inference.per_spot import best_width, coefficients, sparse
+from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.fit import SurfelFit
@@ -142,7 +142,7 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
     columns = weighted_columns(problem, effect)
     if effect.per_spot:
         column = columns[:, 0].view(problem.expected.shape)
-        score, information, _ = _scores(column, projector, at[problem.spots])
+        score, information, _ = _scores(problem, projector, effect, column, at[problem.spots])
         return best_width(score, information, sparse(effect))[0] - math.log(shapes)
     z = projector.off(columns)
     return _evidence(problem, projector.residual, effect, columns, z, block, at).nats - math.log(shapes)
@@ -289,7 +289,7 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     for shape in shapes:
         effect.set_all(shape)
         column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
-        score, information, scatter = _scores(column, projector)
+        score, information, scatter = _scores(problem, projector, effect, column)
         gain, width, share = best_width(score, information, sparse(effect))
         nats.append(gain)
         if best is None or gain > best[0]:
@@ -305,7 +305,9 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     return Candidate(effect, nats_of_all, 1.0, scatter, shape, full, error, nats_of_all)
 
 
-def _scores(column: Tensor, projector: Projector, at: Tensor | None = None) -> tuple[Tensor, Tensor, float]:
+def _scores(
+    problem: Problem, projector: Projector, effect: Effect, column: Tensor, at: Tensor | None = None
+) -> tuple[Tensor, Tensor, float]:
     """Score and information of each spot's own coefficient ``[S]``, discounted by their scatter, and that."""
     residual = projector.residual[: column.numel()].view_as(column)
     information = column.square().sum(1).double().clamp_min(1e-30)
@@ -313,6 +315,8 @@ def _scores(column: Tensor, projector: Projector, at: Tensor | None = None) -> t
     scatter = spot_scatter(column, residual)
     if at is not None:
         score = score + information * at
+    if not sparse(effect):
+        score, information = own_part(score, information, neighbours(problem.model, problem.spots))
     return score / scatter, information / scatter, scatter
 
 

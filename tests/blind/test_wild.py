@@ -20,7 +20,7 @@ from conftest import ROOT
 from scipy.special import ndtr
 from wild_counting import photon_by_photon, recorded
 from wild_scenes import FAMILIES, OWN, WildScene, load
-from wild_statistic import nuisances, profiled, statistic, true_statistics
+from wild_statistic import nuisances, profiled, rendering, statistic, true_statistics
 from wild_table import ALL, BLOCK, LENGTH, MASTER_SEEDS, Spec, _block, seed_of, spec_of, table
 from wild_truth import hide, make, scan_order, write
 from wild_unknown import UNKNOWN
@@ -331,10 +331,32 @@ def test_a_scene_takes_up_an_offset_but_no_jitter():
     assert 0 < shown["time_offset"].projected < 0.1 * shown["time_offset"].plain
     assert shown["jitter_heavy"].projected > 0.5 * shown["jitter_heavy"].plain
     basis = nuisances(truth)
-    albedo = basis[: (len(basis) - 2) // 2].sum(axis=0)
+    number = (len(basis) - 5) // 4
+    albedo = basis[:number].sum(axis=0)
     signal = truth.without - truth.dark
     assert albedo.sum() == pytest.approx(signal.sum(), rel=0.05)
     assert np.corrcoef(albedo.ravel(), signal.ravel())[0, 1] > 0.99
+
+
+def test_a_scene_that_lies_aside_takes_up_a_wrong_baseline():
+    """By half of it, to first order; a scene that must stay where it is would show most of it."""
+    truth = hide(Spec("letters", effects=("baseline_skewed",), strengths=(1,), level=2000, seed=6, side=SIDE))
+    at_once, again = (true_statistics(truth, steps)["baseline_skewed"] for steps in (0, 8))
+    assert at_once.projected < 0.5 * at_once.plain
+    assert again.projected < 0.5 * at_once.projected
+
+
+def test_moves_of_patches_are_those_of_a_scene_seen_anew():
+    """By about a bin, of a patch or of the whole scene along each axis: by the derivative, and rendered."""
+    truth = hide(Spec("letters", effects=("jitter_heavy",), strengths=(0,), level=2000, seed=6, side=SIDE))
+    basis = nuisances(truth)
+    number = (len(basis) - 5) // 4
+    for k in (number + 3, 2 * number + 3, 3 * number + 3, 4 * number, 4 * number + 1, 4 * number + 2):
+        change, step = np.zeros(len(basis)), 0.3 if k < 4 * number else 0.03
+        change[k] = step
+        moved = (rendering(truth, change) - rendering(truth, -change)) / (2 * step)
+        assert np.corrcoef(moved.ravel(), basis[k].ravel())[0, 1] > 0.96, k
+        assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(basis[k]), rel=0.08), k
 
 
 def test_files_tell_nothing_and_repeat(tmp_path):

@@ -20,9 +20,11 @@ from data_modules.simulate.sensor import response_kernel
 PATCHES = 96
 MOST = 10_000  # elements that make the patches
 ALBEDO = 1.0  # prior standard deviation of a patch's log albedo
-BINS = 3.0  # of the path to a patch, bins
+BINS = 3.0  # by which a patch may lie elsewhere along each of three axes, bins …
+WHOLE = 30.0  # … and the whole scene
 WIDTH = 0.5  # of the response's logarithmic widths
 HALF = 2  # steps in a bin
+CLEAR = 100.0  # from which on an effect should be named
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,13 @@ class Statistic:
     projected: float
 
 
-def true_statistics(truth: Truth, steps: int = 0) -> dict[str, Statistic]:
+def true_statistics(truth: Truth, steps: int = 8) -> dict[str, Statistic]:
     """Of every injection, each against the capture that lacks only it.
 
     Exposure and dark level are in no file, so every method fits both: hence the factor and the level. The
     second number is linear in the changes of the scene: for effects that move light by more than the
-    response is wide it is too large, unless the scene is seen anew after each of some steps.
+    response is wide it is too large, unless the scene is seen anew after each of some steps. That is done
+    for those that show clearly without.
 
     Args:
         truth: of the capture.
@@ -59,6 +62,8 @@ def true_statistics(truth: Truth, steps: int = 0) -> dict[str, Statistic]:
         return found
     return {
         name: replace(first, projected=refined(truth, name, basis, first.projected, steps))
+        if first.projected > CLEAR
+        else first
         for name, first in found.items()
     }
 
@@ -157,10 +162,11 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
 
 
 def nuisances(truth: Truth, change: np.ndarray | None = None) -> np.ndarray:
-    """``[K, S, T]`` changes of counts by patches' albedos and paths and the response's two widths.
+    """``[K, S, T]`` changes of counts by patches' albedos and places and the response's two widths.
 
-    Each is for one prior standard deviation. Rendered patch by patch from the clean scene; a patch that moves
-    away from the wall's middle delays its light at every spot by what its way grows.
+    Each is for one prior standard deviation. Rendered patch by patch from the clean scene; a patch that
+    moves delays its light at every spot by what its way grows. It moves away from the wall's middle and
+    aside, by itself and with all others: where a scene is must be fitted, in all three dimensions.
 
     Args:
         truth: of the capture.
@@ -170,15 +176,20 @@ def nuisances(truth: Truth, change: np.ndarray | None = None) -> np.ndarray:
     elements, seen, groups, widths = _changed(truth, change)
     kernel, first = response_kernel(*widths, scene.window.bin_length / HALF)
     factor = _factor(truth)
-    albedo, depth = [], []
+    albedo, place, whole = [], [], np.zeros((3, len(scene.laser), scene.window.n_bins))
     for k in range(groups.max() + 1):
         mine = elements.of(groups == k)
         light = factor * third_bounce(mine, scene.laser, scene.sensor, seen[:, groups == k], _axis(scene))
         wide = _smeared(light, kernel, first)
         albedo.append(ALBEDO * _bins(wide))
-        depth.append(-BINS * _bins(_slope(wide)) * _growth(scene, mine)[:, None])
+        later = -BINS * _bins(_slope(wide))
+        axes = _axes(scene, mine)
+        place.append([later * growth[:, None] for growth in _growth(scene, mine, axes)])
+        for k, growth in enumerate(_growth(scene, mine, np.eye(3))):
+            whole[k] += WHOLE / BINS * later * growth[:, None]
     total = np.sum(albedo, axis=0) / ALBEDO
-    return np.stack([*albedo, *depth, *_width_changes(scene, widths, total)]).astype(np.float32)
+    moves = [change for along in zip(*place, strict=True) for change in along]
+    return np.stack([*albedo, *moves, *whole, *_width_changes(scene, widths, total)]).astype(np.float32)
 
 
 def rendering(truth: Truth, change: np.ndarray) -> np.ndarray:
@@ -200,10 +211,10 @@ def _changed(
     if change is None:
         return elements, seen, groups, (sigma, 1 / decay)
     number = groups.max() + 1
-    lit, far, (wider, sharper) = change[:number], change[number : 2 * number], change[2 * number :]
-    away = np.stack([_away(scene, elements.of(groups == k)) for k in range(number)])
-    way = far * BINS * scene.window.bin_length / 2
-    moved = elements.centre + (way[:, None] * away)[groups]
+    lit, moves, whole, (wider, sharper) = np.split(change, [number, 4 * number, 4 * number + 3])
+    axes = np.stack([_axes(scene, elements.of(groups == k)) for k in range(number)])
+    way = BINS * np.einsum("jk,kjx->kx", moves.reshape(3, number), axes) + WHOLE * whole
+    moved = elements.centre + (scene.window.bin_length / 2 * way)[groups]
     bright = elements.albedo * np.exp(ALBEDO * lit.clip(-3, 3))[groups]
     limits = (sigma * np.exp(WIDTH * np.clip(wider, -3, 3)), np.exp(WIDTH * np.clip(sharper, -3, 3)) / decay)
     return replace(elements, centre=moved, albedo=bright), seen, groups, limits
@@ -277,18 +288,22 @@ def _bins(light: np.ndarray) -> np.ndarray:
     return light.reshape(len(light), -1, HALF).sum(axis=2)[:, PAD:-PAD]
 
 
-def _away(scene: WildScene, mine: Elements) -> np.ndarray:
-    """Unit vector from the wall's middle to a patch."""
+def _axes(scene: WildScene, mine: Elements) -> np.ndarray:
+    """``[3, 3]`` unit vectors: from the wall's middle to a patch, and two across."""
     centre = mine.area @ mine.centre / mine.area.sum()
     middle = (scene.sensor.min(axis=0) + scene.sensor.max(axis=0)) / 2
-    return (centre - middle) / np.linalg.norm(centre - middle)
+    away = (centre - middle) / np.linalg.norm(centre - middle)
+    across = np.cross(away, [0.0, 1.0, 0.0])
+    across /= np.linalg.norm(across)
+    return np.stack([away, across, np.cross(away, across)])
 
 
-def _growth(scene: WildScene, mine: Elements) -> np.ndarray:
-    """``[S]`` growth of the path for a path that grows by 1 as seen from the wall's middle."""
-    centre, away = mine.area @ mine.centre / mine.area.sum(), _away(scene, mine)
+def _growth(scene: WildScene, mine: Elements, axes: np.ndarray) -> np.ndarray:
+    """``[3, S]`` growth of the path to a patch that moves along each axis by ½."""
+    centre = mine.area @ mine.centre / mine.area.sum()
     legs = (centre - points for points in (scene.laser, scene.sensor))
-    return sum((leg / np.linalg.norm(leg, axis=1, keepdims=True)) @ away for leg in legs) / 2
+    units = sum(leg / np.linalg.norm(leg, axis=1, keepdims=True) for leg in legs)
+    return axes @ units.T / 2
 
 
 def _width_changes(scene: WildScene, widths: tuple[float, float], signal: np.ndarray) -> list[np.ndarray]:

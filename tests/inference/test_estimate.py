@@ -226,8 +226,8 @@ def findings():
     control = Trial(None, base, nothing, Comparison(1.0, 1.0, (-1, 3)), 0.1)
     group = {"irf_tail": 0.6, "afterpulsing": 0.2, "free_wall": 0.2}
     turns = [
-        Turn(first, 8.0, [won, rival, beside, control], won, group, kept(450.0), True),
-        Turn(first[1:], 8.0, [second], second, {"free_wall": 1.0}, kept(80.0), True),
+        Turn(first, 8.0, frozenset(), [won, rival, beside, control], won, group, kept(450.0), True),
+        Turn(first[1:], 8.0, frozenset(), [second], second, {"free_wall": 1.0}, kept(80.0), True),
         Turn(first[3:], 8.0),
     ]
     losses = {"irf_tail": Comparison(250.0, 5.0, (240, 260)), "free_wall": Comparison(60.0, 5.0, (50, 70))}

@@ -164,7 +164,10 @@ def test_a_larger_pool_needs_more():
     pool = [candidate("irf_tail")] * 40
     assert needed(pool, CriticismSettings(level=0.01), 0.0) == pytest.approx(math.log(4000))
     assert needed(pool[:1], CriticismSettings(level=0.1), 0.0) == pytest.approx(math.log(10))
-    assert needed(pool, CriticismSettings(share=0.1), 500.0) == pytest.approx(math.log(4000) + 50)
+    s = CriticismSettings(share=0.1)
+    assert needed(pool, s, 500.0) == pytest.approx(math.log(4000) + 50)
+    for name, share in (("irf_tail", 50), ("hot_spots", 50), ("timing_jitter", 0), ("free_spot_gain", 0)):
+        assert needed(pool, s, 500.0, candidate(name).effect) == pytest.approx(math.log(4000) + share), name
 
 
 def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
@@ -186,15 +189,13 @@ def test_leaders_are_the_best_of_each_kind():
     ]
     found = [candidate(n, 100.0 - k) for k, n in enumerate(names)]
 
-    def names_of(bar: float, number: int) -> list[str]:
-        return [c.name for c in leaders(found, bar, number)]
+    def names_of(number: int) -> list[str]:
+        return [c.name for c in leaders(found, number)]
 
-    assert names_of(8.0, 2) == ["free_wall", "irf_tail", "pile_up", "hot_spots"]
-    assert names_of(8.0, 4) == ["free_wall", "irf_tail", "pile_up", "vignetting", "hum", "hot_spots"]
-    assert names_of(99.9, 4) == names_of(8.0, 4)
-    assert names_of(100.0, 4) == []
+    assert names_of(2) == ["free_wall", "irf_tail", "pile_up", "hot_spots"]
+    assert names_of(4) == ["free_wall", "irf_tail", "pile_up", "vignetting", "hum", "hot_spots"]
     found[8] = replace(found[8], loud=500.0)
-    assert names_of(8.0, 2) == ["free_wall", "irf_tail", "hot_spots", "ambient_map"]
+    assert names_of(2) == ["free_wall", "irf_tail", "hot_spots", "ambient_map"]
 
 
 def test_a_term_begins_where_the_pool_saw_it():
@@ -377,6 +378,18 @@ def test_what_is_next_best_is_asked_in_place_of_what_is_refused(monkeypatch, evi
     assert "irf_tail" not in first.group or not asked
     assert found.grown[0] == set()
     assert {"pile_up"} not in found.grown or asked
+
+
+@pytest.mark.parametrize(("evidence", "named"), [(5.4, True), (5.2, False)])
+def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misfit(
+    monkeypatch, evidence, named
+):
+    """ln(2/level) = 5.3, beside a misfit of 10 000 nats, of which a map would need 200."""
+    monkeypatch.setattr(loop, "solve", lambda *_: None)
+    pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence)]
+    table = {"timing_jitter": gaining(20.0), "wall_reflectance": gaining(40.0, seed=1)}
+    found = World(monkeypatch, table, pool, misfit=10_000.0).criticise()
+    assert [t.best.name for t in found.accepted] == (["timing_jitter"] if named else [])
 
 
 def test_the_better_of_two_scenes_goes_on(monkeypatch):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +14,16 @@ from scipy import integrate
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.heldout import log_likelihood
-from nlos_lit.inference.per_spot import best_width, coefficients, factors, solve, sparse, spot_scores
+from nlos_lit.inference.per_spot import (
+    best_width,
+    coefficients,
+    factors,
+    neighbours,
+    own_part,
+    solve,
+    sparse,
+    spot_scores,
+)
 
 pytestmark = FORWARD_MODE
 
@@ -147,3 +157,43 @@ def test_unseen_spots_still_say_whether_the_width_is_right():
         ]
         assert bool(values[0] > values[1] + 20) is better
         assert bool(values[0] < values[1]) is not better
+
+
+def test_neighbours_are_the_nearest_on_the_wall():
+    """In a row of ten, the eight nearest of each, itself not among them; of few spots, all others."""
+    places = torch.zeros(10, 3)
+    places[:, 0] = torch.arange(10.0) ** 1.01
+    model = SimpleNamespace(laser=places, sensor=torch.zeros(10, 3))
+    near = neighbours(model, torch.arange(10))
+    assert near.shape == (10, 8)
+    for k in range(10):
+        assert set(near[k].tolist()) == set(range(10)) - {k, 9 if k < 5 else 0}
+    assert neighbours(model, torch.tensor([3, 5, 8])).sort(1).values.tolist() == [[1, 2], [0, 2], [0, 1]]
+    assert neighbours(model, torch.tensor([3])).shape == (1, 0)
+    same = SimpleNamespace(laser=torch.zeros(12, 3), sensor=torch.zeros(12, 3))
+    near = neighbours(same, torch.arange(12))
+    assert not (near == torch.arange(12)[:, None]).any()
+
+
+def test_what_is_smooth_over_the_wall_is_no_spots_own():
+    """Delays of 0.5 that are each spot's own, on a slope of many times that: their width is found, and the
+    slope is left. What is known of the neighbours makes the width right, where it was √(9/8) too large.
+    """
+    rng = np.random.default_rng(5)
+    x, y = np.meshgrid(np.arange(32.0), np.arange(32.0), indexing="ij")
+    places = torch.from_numpy(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], 1))
+    model = SimpleNamespace(laser=places, sensor=places)
+    own = torch.from_numpy(0.5 * rng.standard_normal(1024))
+    whole = own + places[:, 0] + 0.05 * places[:, 1] ** 2
+    information = torch.full((1024,), 25.0, dtype=torch.float64)
+    score = information * (whole + 0.2 * torch.from_numpy(rng.standard_normal(1024)))
+    near = neighbours(model, torch.arange(1024))
+    inner = ((x > 1) & (x < 30) & (y > 1) & (y < 30)).ravel()
+    noise = 0.2 * (9 / 8) ** 0.5
+    for known, width, other in ((None, 0.5 * (9 / 8) ** 0.5, 0.5 / 8**0.5), (own, 0.5, 0.0)):
+        s, f = own_part(score, information, near, known)
+        found = best_width(s[inner], f[inner], False)[1]
+        assert found == pytest.approx(width, rel=0.05)
+        delays = coefficients(s, f, found, False)[inner]
+        expected = 0.5 / (0.5**2 + noise**2 + other**2) ** 0.5
+        assert np.corrcoef(delays, own[inner])[0, 1] == pytest.approx(expected, abs=0.02)
