@@ -34,6 +34,8 @@ class Effect(nn.Module, Hooks):
             ``offset``), or nothing.
         per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is
             what is reported.
+        in_runs: of such an effect, neighbouring spots may share their numbers. Otherwise only what a spot has
+            over its neighbours counts.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
         needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
@@ -45,6 +47,7 @@ class Effect(nn.Module, Hooks):
     split_by: ClassVar[Mapping[str, str]] = {}
     witness: ClassVar[Literal["energy", "tail", "delay"] | None] = None
     per_spot: ClassVar[bool] = False
+    in_runs: ClassVar[bool] = False
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False

@@ -59,6 +59,7 @@ class SpotGate(Effect):
         "gate_edges": "steady light on the wall: it shows every spot's own gate",
     }
     per_spot = True
+    in_runs = True
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

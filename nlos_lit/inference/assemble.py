@@ -112,6 +112,7 @@ def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Spli
         split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
+        needed=confirmed.needed,
     )
 
 

@@ -50,7 +50,7 @@ def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
     for effect in fit.extension.effects:
         if effect.per_spot:
             score, information, _ = spot_scores(fit.model, fit.extension, effect, index, counts)
-            if not sparse(effect):
+            if not effect.in_runs:
                 score, information = own_part(score, information, neighbours(fit.model, index))
             value += factors(score, information, effect.width, effect.share, sparse(effect))
     return value

@@ -11,8 +11,8 @@ what does not depend on σ (Laplace; exact for Gaussian counts),
 
 So spots that no fit saw still say whether the width is right.
 
-Coefficients that are not sparse are independent of each other: what a spot shares with its neighbours on the
-wall is none of its own, but the scene's, or another term's. It is taken off first, :func:`own_part`.
+Where coefficients are independent of each other, what a spot shares with its neighbours on the wall is none
+of its own, but the scene's, or another term's. It is taken off first, :func:`own_part`.
 """
 
 from __future__ import annotations
@@ -203,7 +203,7 @@ def solve(
     """
     p = effect.amplitudes[0]
     raw = getattr(effect, f"raw_{p.name}")
-    near = None if sparse(effect) else neighbours(model, spots)
+    near = None if effect.in_runs else neighbours(model, spots)
     for _ in range(rounds):
         score, information, _ = spot_scores(model, extension, effect, spots, counts)
         own = raw[spots].double()

@@ -315,7 +315,7 @@ def _scores(
     scatter = spot_scatter(column, residual)
     if at is not None:
         score = score + information * at
-    if not sparse(effect):
+    if not effect.in_runs:
         score, information = own_part(score, information, neighbours(problem.model, problem.spots))
     return score / scatter, information / scatter, scatter
 

@@ -68,6 +68,7 @@ class Accepted:
         split_by: the measurement that would tell those apart.
         axis: of a free term, else empty.
         shape: of a free term.
+        needed: nats of evidence that this term needed; None for those of all others.
     """
 
     name: str
@@ -78,6 +79,7 @@ class Accepted:
     split_by: str = ""
     axis: str = ""
     shape: Shape | None = None
+    needed: float | None = None
 
     @property
     def confusable_with(self) -> list[str]:

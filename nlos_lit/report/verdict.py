@@ -204,11 +204,14 @@ def _evidence(diagnosis: Diagnosis, terms: list[Accepted]) -> str:
     found = [term.evidence for term in terms if math.isfinite(term.evidence)]
     if found:
         least = "each of them is at least" if len(terms) > 1 else "it is"
-        return f"The evidence for {least} {number(min(found))} nats; {needed}."
-    asked = [s for s in diagnosis.screened if math.isfinite(s.evidence)]
-    if terms or not asked:
+        bars = [diagnosis.needed if term.needed is None else term.needed for term in terms]
+        low, high = number(min(bars)), number(max(bars))
+        asked = low if low == high else f"{low} – {high}"
+        return f"The evidence for {least} {number(min(found))} nats; {asked} are needed."
+    pool = [s for s in diagnosis.screened if math.isfinite(s.evidence)]
+    if terms or not pool:
         return ""
-    most = max(asked, key=lambda s: s.evidence)
+    most = max(pool, key=lambda s: s.evidence)
     text = f"The most evidence, {number(most.evidence)} nats, is for {describe(most.name).phrase}; {needed}"
     return f"{text}, but other spots did not confirm it." if most.evidence > diagnosis.needed else f"{text}."
 

@@ -120,7 +120,8 @@ def test_solve_finds_the_hot_spots_and_no_others():
         score, information, _ = spot_scores(
             model, Extension([effect]), effect, torch.tensor([spot]), counts[spot : spot + 1]
         )
-        assert abs(float(score)) < 0.05 * float(information) ** 0.5  # Newton steps have come to rest
+        # Newton steps have come to rest at what the spot has over eight neighbours, to their counting noise.
+        assert abs(float(score)) < 3 * (float(information) / 8) ** 0.5
     assert 0.01 <= effect.share <= 0.1
 
 

@@ -132,6 +132,7 @@ def test_json_is_the_diagnosis(written, case):
             "split_by",
             "axis",
             "shape",
+            "needed",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
         assert set(effect["heldout_gain"]) == {
@@ -274,6 +275,9 @@ def test_sureness_is_not_more_than_there_is():
     assert "each of them is at least 512 nats" in sureness(CASES["both"])
     assert sureness(CASES["nothing"]).startswith("The most evidence, 5.48 nats, is for something unknown in")
     assert "8.16 are needed." in sureness(CASES["nothing"])
+    own, other = (dataclasses.replace(TILT, needed=bar) for bar in (8.3, 249.0))
+    assert "it is 961 nats; 8.30 are needed." in sureness(diagnosis(effects=[own]))
+    assert "at least 961 nats; 8.30 – 249 are needed." in sureness(diagnosis(effects=[own, other]))
     assert "8.16 are needed, but other spots did not confirm it." in sureness(diagnosis(screened=screened()))
     assert "Effects tested: 23, of which 1 barely identifiable in this capture, 2 not at all" in sureness(
         CASES["nothing"]

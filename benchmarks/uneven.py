@@ -1,0 +1,105 @@
+"""How uneven the patches of fitted scenes truly are: what the pool's prior on them stands on.
+
+    python benchmarks/uneven.py 2 4 21         development captures without effects, of scenes of our own
+
+The light of the true surface is put together by the surfel that is nearest to it, and fitted as the surfels'
+own light times 1 plus five functions of the wall point. Printed are root mean squares of their coefficients,
+weighted by light, over groups of surfels that lie together (docs/notebook.md).
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind")]
+GROUPS = (1, 8, 32, 128)
+FAINTEST = 1e-3  # of a group's mean light: spots that see less of it say nothing
+
+
+def lights(model, scene) -> tuple[Tensor, Tensor]:
+    """``[S, M]`` light that each surfel sends, and that the true surface nearest to it does."""
+    from scipy.spatial import cKDTree
+
+    from nlos_lit.functional.surfel_paths import quadrature, trace
+
+    elements = scene.elements
+    place, normal, shine, seen = (
+        torch.from_numpy(v).float()
+        for v in (elements.centre, elements.normal, elements.area * elements.albedo, 1.0 * scene.seen)
+    )
+    centre, facing = model.placed()
+    nearest = torch.from_numpy(cKDTree(centre.numpy()).query(elements.centre)[1])
+    fitted, true = [], []
+    for spots in torch.arange(len(model.laser)).split(48):
+        wall = (
+            model.laser[spots],
+            model.laser_normal[spots],
+            model.sensor[spots],
+            model.sensor_normal[spots],
+        )
+        own = trace(centre, facing, model.cell, quadrature(model.quadrature), *wall, model.confocal)
+        clear = model.arriving(model.visible[spots]) if len(model.visible) else 1.0
+        fitted.append(own.contribution.sum(2) * model.albedo() * clear)
+        paths = trace(place, normal, torch.ones(2), quadrature(1), *wall, model.confocal)
+        light = paths.contribution[:, :, 0] / paths.area * shine * seen[spots]
+        true.append(torch.zeros(len(spots), len(centre)).index_add_(1, nearest, light))
+    return torch.cat(fitted), torch.cat(true)
+
+
+def unevenness(fitted: Tensor, true: Tensor, towards: Tensor, group: Tensor) -> float:
+    """Root mean square of the coefficients of ``towards`` ``[S, J]`` over groups ``[M]`` of surfels."""
+    number = int(group.max()) + 1
+    own, real = (torch.zeros(len(v), number).index_add_(1, group, v).double() for v in (fitted, true))
+    functions = torch.cat([torch.ones(len(towards), 1), towards], 1).double()
+    total, weight = 0.0, 0.0
+    for k in range(number):
+        there = own[:, k] > FAINTEST * own[:, k].mean()
+        root = own[there, k].sqrt()[:, None]
+        found = torch.linalg.lstsq(functions[there] * root, real[there, k, None] / root).solution[:, 0]
+        if len(root) and found[0] > 0:
+            light = float(real[:, k].sum())
+            total += light * float((found[1:] / found[0]).clamp(-2, 2).square().mean())
+            weight += light
+    return (total / weight) ** 0.5
+
+
+@torch.no_grad()
+def report(index: int) -> None:
+    """Print one development capture's rows, of its parsimonious and of its fine scene."""
+    from blind_judge import pipeline_for
+    from wild_truth import make
+
+    from data_modules.readers import read_capture
+    from nlos_lit.inference.problem import patches_of, towards_wall
+    from nlos_lit.inference.split import split_spots
+
+    with tempfile.TemporaryDirectory() as folder:
+        truth = make("development", index, Path(folder) / "capture.hdf5")
+        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    spec = truth.spec
+    if spec.effects or not truth.scene.own:
+        print(f"{index}: skipped, not an effect-free scene of our own")
+        return
+    pipeline, split = pipeline_for(capture), split_spots(capture)
+    with torch.enable_grad():
+        base = pipeline(capture, split, 0)
+        fine = pipeline.grow(base, 0)
+    for name, fit in (("base", base), ("fine", fine)):
+        model = fit.model
+        found = lights(model, truth.scene)
+        groups = [patches_of(model, n) for n in GROUPS] + [torch.arange(len(model))]
+        rows = [(int(g.max()) + 1, unevenness(*found, towards_wall(model), g)) for g in groups]
+        said = ", ".join(f"{number}: {value:.3f}" for number, value in rows)
+        print(f"{index} {spec.family} {spec.scan} {spec.level:g} {name}: {said}", flush=True)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for wanted in sys.argv[1:]:
+        report(int(wanted))
