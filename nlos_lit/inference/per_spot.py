@@ -39,7 +39,15 @@ def sparse(effect: Effect) -> bool:
 
 
 def neighbours(model: SurfelModel, spots: Tensor) -> Tensor:
-    """``[S, K]`` for each of ``spots`` ``[S]``, which of them are nearest to it on the wall."""
+    """Which spots are nearest to each on the wall.
+
+    Args:
+        model: that knows their laser and sensor points.
+        spots: ``[S]`` rows of the capture.
+
+    Returns:
+        ``[S, K]`` places in ``spots``, of ``NEIGHBOURS`` others or of all there are.
+    """
     places = torch.cat([model.laser[spots], model.sensor[spots]], 1).cpu().numpy()
     number = min(NEIGHBOURS, len(spots) - 1)
     near = torch.from_numpy(cKDTree(places).query(places, number + 1)[1]).view(len(spots), -1)
