@@ -46,10 +46,6 @@ def test_nothing_hidden_nothing_named():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="nothing was named: the base is 16 % above noise, and refining it gains more (docs/criticism.md)",
-    strict=False,
-)
 def test_two_effects_are_both_named_and_measured():
     names = ("irf_tail", "wall_reflectance")
     outcome = run_case(
