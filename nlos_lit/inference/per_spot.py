@@ -24,6 +24,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from nlos_lit.capture import Capture
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.problem import effect_columns
@@ -38,17 +39,18 @@ def sparse(effect: Effect) -> bool:
     return effect.amplitudes[0].lower == effect.amplitudes[0].null
 
 
-def neighbours(model: SurfelModel, spots: Tensor) -> Tensor:
+def neighbours(scan: SurfelModel | Capture, spots: Tensor) -> Tensor:
     """Which spots are nearest to each on the wall.
 
     Args:
-        model: that knows their laser and sensor points.
+        scan: what knows their laser and sensor points.
         spots: ``[S]`` rows of the capture.
 
     Returns:
         ``[S, K]`` places in ``spots``, of ``NEIGHBOURS`` others or of all there are.
     """
-    places = torch.cat([model.laser[spots], model.sensor[spots]], 1).cpu().numpy()
+    points = [torch.as_tensor(p, device="cpu")[spots] for p in (scan.laser, scan.sensor)]
+    places = torch.cat(points, 1).numpy()
     number = min(NEIGHBOURS, len(spots) - 1)
     near = torch.from_numpy(cKDTree(places).query(places, number + 1)[1]).view(len(spots), -1)
     itself = near == torch.arange(len(spots))[:, None]

@@ -10,14 +10,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 
 from nlos_lit.capture import Capture
 from nlos_lit.effects import EFFECTS
+from nlos_lit.inference.per_spot import neighbours
 from nlos_lit.surfels.fit import SurfelFit
 
 LEAST = 20.0  # counts a spot before the gate that make a witness
-NEIGHBOURS = 8  # of a spot, over whose mean a delay that is the spot's own stands
 
 
 def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
@@ -60,10 +59,10 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         if effect.witness == "delay":
             fitted = effect.value("offset").detach().reshape(-1).double().numpy()
             spots = np.flatnonzero(fitted)  # those of other spots stay at 0
-            places = capture.laser[spots, :2]
+            near = neighbours(capture, torch.from_numpy(spots)).numpy()
             delays = {
-                "direct": over_neighbours(direct_delays(capture)[spots], places),
-                "fitted": over_neighbours(fitted[spots], places),
+                "direct": over_neighbours(direct_delays(capture)[spots], near),
+                "fitted": over_neighbours(fitted[spots], near),
             }
             found["delay_correlation"] = float(np.corrcoef(delays["direct"], delays["fitted"])[0, 1])
             found["delays"] = {name: d.tolist() for name, d in delays.items()}
@@ -90,19 +89,18 @@ def direct_delays(capture: Capture) -> np.ndarray:
     return capture.bin_length * shifted / strength.clip(1e-9)
 
 
-def over_neighbours(values: np.ndarray, places: np.ndarray) -> np.ndarray:
+def over_neighbours(values: np.ndarray, near: np.ndarray) -> np.ndarray:
     """What each spot has over the mean of its nearest neighbours.
 
     What is smooth over the wall is no spot's own.
 
     Args:
         values: ``[S]``.
-        places: ``[S, 2]`` on the wall.
+        near: ``[S, K]`` from :func:`~nlos_lit.inference.per_spot.neighbours`.
 
     Returns:
         ``[S]``.
     """
-    near = cKDTree(places).query(places, NEIGHBOURS + 1)[1][:, 1:]
     return values - values[near].mean(1)
 
 

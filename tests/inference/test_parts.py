@@ -20,6 +20,7 @@ from nlos_lit.inference import toys
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.per_spot import neighbours
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
 from nlos_lit.inference.witness import direct_decays, direct_delays, log_gain, over_neighbours, witness
@@ -154,7 +155,8 @@ def test_the_witness_knows_the_time_zero_of_single_spots():
     seen = capture_of(raster(side), counts=counts, gate=(160, 200), t_start=0.0)
     assert direct_delays(seen) == pytest.approx(BIN * (late - late.mean()), abs=0.01 * BIN)
     places = seen.laser[:, :2]
-    assert over_neighbours(places[:, 0], places).reshape(side, side)[2:-2, 2:-2] == pytest.approx(0, abs=1e-9)
+    near = neighbours(seen, torch.arange(side**2)).numpy()
+    assert over_neighbours(places[:, 0], near).reshape(side, side)[2:-2, 2:-2] == pytest.approx(0, abs=1e-9)
     for own, r in ((late, 1.0), (np.roll(late, 77), 0.0)):
         jitter = effect_of("timing_jitter", Scan.of(seen))
         with torch.no_grad():
