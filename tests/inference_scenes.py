@@ -146,12 +146,18 @@ def drawn(
 
 
 def problem_of(
-    spots: Tensor, expected: Tensor, nuisance: Tensor, residual: Tensor, prior: Tensor | None = None
+    spots: Tensor,
+    expected: Tensor,
+    nuisance: Tensor,
+    residual: Tensor,
+    prior: Tensor | None = None,
+    uneven: Tensor | None = None,
 ) -> Problem:
     """A least-squares problem without a model behind it."""
     prior = torch.zeros(nuisance.shape[1]) if prior is None else prior
+    uneven = torch.zeros(len(nuisance), 0) if uneven is None else uneven
     given = {"extension": Extension([]), "spots": spots, "counts": expected, "expected": expected}
-    given |= {"nuisance": nuisance, "residual": residual, "prior": prior}
+    given |= {"nuisance": nuisance, "residual": residual, "prior": prior, "uneven": uneven}
     return Problem(**{f.name: given.get(f.name) for f in dataclasses.fields(Problem)})
 
 

@@ -188,7 +188,7 @@ def needed(
 
 
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
-    """How much likelier than by the fit counts would be if all but counting noise were explained.
+    """How much likelier than by the fit some counts would be if all but counting noise were explained.
 
     Args:
         fit: that is judged.
@@ -196,10 +196,10 @@ def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
         number: of spots that it is said for.
 
     Returns:
-        nats, half the deviance above the noise's; 0 where there is none.
+        nats, half the deviance above the noise's; below 0 where surfels have taken up noise.
     """
     found = score(fit, spots)
-    return max(0.0, 0.5 * (found.deviance_per_bin - found.deviance_noise) * number * fit.counts.shape[1])
+    return 0.5 * (found.deviance_per_bin - found.deviance_noise) * number * fit.counts.shape[1]
 
 
 def begun_with(fit: SurfelFit, extra: list[Candidate]) -> Extension:
@@ -309,7 +309,7 @@ class Loop:
         candidates = self.steps(
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
-        misfit = self._misfit(fine, self.split.fit)
+        misfit = self._misfit(fine, self.split.fit)  # before it is in the model, a term is part of it itself
         bars = {c.name: needed(candidates, s, misfit, c.effect) for c in candidates}
         asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
         turn = Turn(candidates, needed(candidates, s, misfit), asked)
@@ -353,28 +353,41 @@ class Loop:
             return turn
         return replace(turn, best=best, group=group_of(best, trials, self.block, self.settings.open_share))
 
-    def confirm(self, turn: Turn, fine: SurfelFit, without: SurfelFit) -> Turn:
-        """Is the turn's best term still asked for beside a fine scene?
+    def own(self, turn: Turn, fine: SurfelFit) -> tuple[float, float]:
+        """How much the turn's best term is asked for beside a fine scene.
 
         Args:
             turn: with a best term.
             fine: the fine scene with it.
-            without: the fine scene without it.
 
         Returns:
-            the turn, accepted or not.
+            its own evidence and what it needs, nats.
         """
         assert turn.best is not None
         s, name = self.settings, turn.best.name
         own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
         tried = "" if turn.confirmed is None else "_again"
         nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}{tried}", own)
+        misfit = self._misfit(fine, self.split.fit, self.split.select)
+        effect = next(e for e in fine.extension.effects if e.name == name)
+        return nats, needed(turn.candidates, s, misfit, effect)
+
+    def confirm(self, turn: Turn, own: tuple[float, float], fine: SurfelFit, without: SurfelFit) -> Turn:
+        """Is the turn's best term still asked for beside a fine scene?
+
+        Args:
+            turn: with a best term.
+            own: its evidence there, and what it needs.
+            fine: the fine scene with it.
+            without: the fine scene without it.
+
+        Returns:
+            the turn, accepted or not.
+        """
         before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
-        misfit = self._misfit(fine, self.split.select)
-        bar = needed(turn.candidates, s, misfit, next(e for e in fine.extension.effects if e.name == name))
         weight = weights([before, after], self.block)[1]
-        found = Confirmed(nats, bar, compare(before, after, self.block), weight)
-        yes = nats > bar and weight > 1 - s.open_share
+        found = Confirmed(*own, compare(before, after, self.block), weight)
+        yes = found.evidence > found.needed and weight > 1 - self.settings.open_share
         return replace(turn, confirmed=found, accepted=yes)
 
     def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:
@@ -390,11 +403,13 @@ class Loop:
         assert turn.best is not None
         again = self.again(turn.best)
         refined = self.fine(again, f"with_{turn.best.name}_{self.number}")
-        turn = self.confirm(turn, refined, self.fair(turn, again, fine))
-        found = turn.confirmed
-        if found is not None and not turn.accepted and found.evidence > found.needed:
+        own = self.own(turn, refined)
+        if own[0] <= own[1]:
+            return self.confirm(turn, own, refined, fine), again, refined
+        turn = self.confirm(turn, own, refined, self.fair(turn, again, fine))
+        if not turn.accepted:
             refined, without = self.beside(turn, refined, fine)
-            turn = self.confirm(turn, refined, without)
+            turn = self.confirm(turn, self.own(turn, refined), refined, without)
         return turn, again, refined
 
     def beside(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> tuple[SurfelFit, SurfelFit]:
@@ -472,13 +487,14 @@ class Loop:
         before, after = (log_likelihood(f, self.split.select).sum() for f in (fine, other))
         return other if after > before else fine
 
-    def _misfit(self, fit: SurfelFit, spots: np.ndarray) -> float:
-        """By some spots, for as many as the pool is asked on.
+    def _misfit(self, fit: SurfelFit, *parts: np.ndarray) -> float:
+        """In the mean of some parts of the spots, for as many as the pool is asked on.
 
-        To be tried, by the fitted ones, of which surfels take up noise: before it is in the model, a term is
-        part of the misfit itself. To be accepted, by the others.
+        What surfels take up of the noise of fitted spots they add to that of the others: the mean of both
+        holds neither.
         """
-        return misfit_of(fit, spots, min(len(self.split.fit), self.settings.spots))
+        number = min(len(self.split.fit), self.settings.spots)
+        return max(0.0, sum(misfit_of(fit, spots, number) for spots in parts) / len(parts))
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""

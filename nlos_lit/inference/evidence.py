@@ -16,6 +16,11 @@ What X may do only so much of has a prior, N(0, 1/p). It is one more row of X, �
 Z and r: least squares with that row is the posterior mean, and the projections of Z and r keep what they
 would ask of it. (Without that row Z⊥ᵀZ⊥ counts the prior twice.)
 
+How uneven the scene's patches look from the wall, U, is a random effect like a term: its coefficients are
+N(0, u²), and u is where the likelihood is largest, without the term and with it. The first is what the
+second is held against: light that changes over the wall alike for all patches is cheaper as a gain of the
+wall than as what each patch happens to do, the more so the more even the scene is.
+
 A base that is wrong in places leaves scores that no common coefficient explains. Their scatter φ_i, where it
 exceeds that of counts, divides scores and information (the sandwich of P. Huber, 1967, and of K.-Y. Liang and
 S. Zeger, *Biometrika* 73, 1986). It is the larger of two: between wall blocks, and between the parts of each
@@ -26,8 +31,9 @@ by itself: what several patches of the scene would all have to do counts for a t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -38,12 +44,39 @@ from nlos_lit.inference.problem import Problem
 
 SEGMENTS = 4  # parts of a wall block along time
 VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
+UNEVENNESS = np.exp(np.linspace(math.log(2e-3), math.log(0.5), 24))  # u that are tried
+
+
+def log_factor(values: Tensor, squares: Tensor, variances: Tensor) -> Tensor:
+    """Log Bayes factor of random coefficients against none, see the module's equation.
+
+    Args:
+        values: ``[…, k]`` eigenvalues of their information.
+        squares: ``[…, k]`` of their scores in its eigenbasis.
+        variances: ``[V]`` of the coefficients.
+
+    Returns:
+        ``[…, V]`` nats.
+
+    Examples:
+        >>> one = torch.tensor([3.0])
+        >>> [round(v, 3) for v in log_factor(one, one * 16, torch.tensor([0.0, 1.0])).tolist()]
+        [0.0, 5.307]
+    """
+    grown = 1 + variances[:, None] * values[..., None, :]
+    return 0.5 * (variances[:, None] * squares[..., None, :] / grown - grown.log()).sum(-1)
 
 
 class Projector:
     """Takes from any columns what the base can explain by itself.
 
-    Projected columns have the problem's rows, then one for each nuisance column that has a prior.
+    In two steps: :meth:`free` takes off what is free or has a known prior, :meth:`even` what patches of the
+    scene do by looking uneven, with one of the deviations ``UNEVENNESS``. Columns grow by a row for each
+    nuisance column that has a prior, then by one for each column of U.
+
+    Attributes:
+        width: which of ``UNEVENNESS`` the counts ask for without any term. levels: nats of each below it.
+        residual: after both steps, at that width.
     """
 
     def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
@@ -60,12 +93,57 @@ class Projector:
             ridge *= 10
         self.nuisance, self.held = x, problem.prior.nonzero()[:, 0]
         self.strength = problem.prior[self.held, None].sqrt()
-        self.residual = self.off(problem.residual[:, None])[:, 0]
+        self.uneven, self.left = self.free(problem.uneven), self.free(problem.residual[:, None])
+        values, self.axes = torch.linalg.eigh((self.uneven.T @ self.uneven).double())
+        self.values = values.clamp_min(0.0)
+        self.variances = torch.from_numpy(UNEVENNESS**2)
+        self.asked = self._along(self.left)[:, 0]
+        levels = log_factor(self.values, self.asked**2, self.variances)
+        self.width = int(levels.argmax())
+        self.levels = levels - levels[self.width]
+        self.residuals: dict[int, Tensor] = {}
+        self.residual = self.residual_at(self.width)
 
-    def off(self, columns: Tensor) -> Tensor:
-        """``[N + Q, k]``: ``columns`` ``[N, k]`` without their projection on the nuisance."""
+    def free(self, columns: Tensor) -> Tensor:
+        """``[N + H, k]``: ``columns`` ``[N, k]`` without their projection on the nuisance."""
         weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
         return torch.cat([columns - self.nuisance @ weights, -self.strength * weights[self.held]])
+
+    def even(self, z: Tensor, width: int) -> Tensor:
+        """``[N + H + Q, k]``: :meth:`free` columns without what patches do that are so uneven."""
+        variance = self.variances[width]
+        shrink = variance / (1 + variance * self.values)
+        weights = (self.axes @ (shrink[:, None] * self._along(z))).float()
+        return torch.cat([z - self.uneven @ weights, -weights / variance.sqrt().float()])
+
+    def off(self, columns: Tensor) -> Tensor:
+        """``[N + H + Q, k]``: ``columns`` ``[N, k]`` after both steps, at the width without any term."""
+        return self.even(self.free(columns), self.width)
+
+    def residual_at(self, width: int) -> Tensor:
+        """``[N + H + Q]`` residual at another width."""
+        if width not in self.residuals:
+            self.residuals[width] = self.even(self.left, width)[:, 0]
+        return self.residuals[width]
+
+    def width_beside(self, z: Tensor, deviation: Tensor) -> int:
+        """Which of ``UNEVENNESS`` the counts ask for beside a term of :meth:`free` columns ``z``.
+
+        ``deviation`` ``[k]`` is C^½.
+        """
+        across, scale = self._along(z) * deviation, torch.outer(deviation, deviation)
+        shrink = self.variances[:, None] / (1 + self.variances[:, None] * self.values)
+        information = (z.T @ z).double() * scale - torch.einsum("qk,vq,ql->vkl", across, shrink, across)
+        score = (z.T @ self.left)[:, 0].double() * deviation - (shrink * self.asked) @ across
+        values, vectors = torch.linalg.eigh(information)
+        values = values.clamp_min(1e-12 * float(values.max().clamp_min(1e-30)))
+        squares = torch.einsum("vk,vkl->vl", score, vectors) ** 2
+        nats = log_factor(values, squares, torch.from_numpy(VARIANCES)).amax(1)
+        return int((self.levels + nats).argmax())
+
+    def _along(self, z: Tensor) -> Tensor:
+        """Scores of the uneven columns' eigenvectors ``[Q, k]``."""
+        return self.axes.T @ (self.uneven.T @ z).double()
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
@@ -138,9 +216,8 @@ def evidence(
     block: Tensor,
     deviation: Tensor,
     bounds: tuple[Tensor, Tensor] | None = None,
-    at: Tensor | None = None,
 ) -> Evidence:
-    """The log Bayes factor of a term.
+    """The log Bayes factor of a term, the base projected off.
 
     Args:
         raw: ``[S, T, k]`` weighted columns.
@@ -149,7 +226,6 @@ def evidence(
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
-        at: ``[k]`` coefficients at which columns and residual were taken; None for the null.
 
     Returns:
         what the counts say of it.
@@ -167,8 +243,6 @@ def evidence(
     f = torch.cat([f, held[:, :, None] * held[:, None]])
     values, vectors = torch.linalg.eigh(f.sum(0))
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
-    if at is not None:
-        s = s + f @ (at.double() / deviation)
     u, tried = s.sum(0) @ vectors, torch.from_numpy(VARIANCES)[:, None]
 
     def best(scatter: Tensor, bounds: tuple[Tensor, Tensor] | None) -> tuple[float, float, Tensor]:
@@ -199,6 +273,35 @@ def evidence(
         scatter=float((scatter * share).sum() / share.sum().clamp_min(1e-30)),
         loud=loud,
     )
+
+
+def best_evidence(
+    projector: Projector,
+    raw: Tensor,
+    z: Tensor,
+    block: Tensor,
+    deviation: Tensor,
+    bounds: tuple[Tensor, Tensor] | None = None,
+) -> Evidence:
+    """The log Bayes factor of a term, the scene as uneven as the counts ask for without it, or with it.
+
+    Args:
+        projector: of the base.
+        raw: ``[S, T, k]`` weighted columns.
+        z: ``[S·T + H, k]``, the same after :meth:`Projector.free`.
+        block: ``[S]`` number of each spot's wall block.
+        deviation: ``[k]`` C^½.
+        bounds: ``[k]`` least and largest coefficients.
+
+    Returns:
+        what the counts say of it, at the width where they say most.
+    """
+    found = []
+    for width in sorted({projector.width, projector.width_beside(z, deviation)}):
+        one = evidence(raw, projector.even(z, width), projector.residual_at(width), block, deviation, bounds)
+        level = float(projector.levels[width])
+        found.append(replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)))
+    return max(found, key=lambda one: one.nats)
 
 
 def segments(z: Tensor, residual: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

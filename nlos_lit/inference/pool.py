@@ -15,7 +15,14 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.evidence import SEGMENTS, Evidence, Projector, evidence, prior_deviations, step_bounds
+from nlos_lit.inference.evidence import (
+    SEGMENTS,
+    Evidence,
+    Projector,
+    best_evidence,
+    prior_deviations,
+    step_bounds,
+)
 from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
@@ -134,7 +141,7 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
     """
     effect = next(e for e in fit.extension.effects if e.name == name)
     problem, block = _problem(fit, split, most, seed, without=effect)
-    projector, shapes = Projector(problem), len(effect.shape_grid())
+    shapes = len(effect.shape_grid())
     null = copy.deepcopy(effect)
     for p in null.amplitudes:
         null.set(p.name, 0.0 if p.null is None else p.null)
@@ -142,10 +149,12 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
     columns = weighted_columns(problem, effect)
     if effect.per_spot:
         column = columns[:, 0].view(problem.expected.shape)
-        score, information, _ = _scores(problem, projector, effect, column, at[problem.spots])
+        score, information, _ = _scores(problem, Projector(problem), effect, column, at[problem.spots])
         return best_width(score, information, sparse(effect))[0] - math.log(shapes)
-    z = projector.off(columns)
-    return _evidence(problem, projector.residual, effect, columns, z, block, at).nats - math.log(shapes)
+    projector = Projector(replace(problem, residual=problem.residual + columns @ at))
+    return _evidence(problem, projector, effect, columns, projector.free(columns), block).nats - math.log(
+        shapes
+    )
 
 
 def _amplitudes(effect: Effect) -> Tensor:
@@ -181,36 +190,23 @@ def screen(problem: Problem, effects: list[Effect], block: Tensor) -> list[Candi
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
     others = (e for e in effects if not e.per_spot)
     for group in _groups((e, _worthwhile(problem, projector, e)) for e in others):
-        z = projector.off(torch.cat([columns for _, kept in group for _, columns in kept], 1))
+        z = projector.free(torch.cat([columns for _, kept in group for _, columns in kept], 1))
         start = 0
         for effect, kept in group:
             tried = []
             for shape, columns in kept:
                 part = z[:, start : start + columns.shape[1]]
                 start += columns.shape[1]
-                tried.append((shape, _evidence(problem, projector.residual, effect, columns, part, block)))
+                tried.append((shape, _evidence(problem, projector, effect, columns, part, block)))
             found.append(_candidate(effect, tried))
     return sorted(found, key=lambda c: -c.evidence)
 
 
 def _evidence(
-    problem: Problem,
-    residual: Tensor,
-    effect: Effect,
-    columns: Tensor,
-    z: Tensor,
-    block: Tensor,
-    at: Tensor | None = None,
+    problem: Problem, projector: Projector, effect: Effect, columns: Tensor, z: Tensor, block: Tensor
 ) -> Evidence:
-    return evidence(
-        columns.reshape(*problem.expected.shape, -1),
-        z,
-        residual,
-        block,
-        prior_deviations(effect),
-        step_bounds(effect),
-        at,
-    )
+    raw = columns.reshape(*problem.expected.shape, -1)
+    return best_evidence(projector, raw, z, block, prior_deviations(effect), step_bounds(effect))
 
 
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:

@@ -4,9 +4,10 @@ least-squares problem.
 Rows are gated bins of the looked-at spots, divided by √μ, so that counts of the model itself have unit
 variance.
 
-- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, how bright each
-  patch of the scene is from where on the wall and where it lies along x and y, the laser-sensor response,
-  what passes the sheets in front, and the parameters of effects that were accepted before.
+- ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, where each patch of
+  the scene lies along x and y, the laser-sensor response, what passes the sheets in front, and the parameters
+  of effects that were accepted before.
+- ``U [N, Q]``: how bright each patch is from where on the wall, all alike unknown by a deviation of its own.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
@@ -30,8 +31,9 @@ from nlos_lit.effects.free_terms import FREE
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
 
-PATCHES = 32  # of the scene, each of which looks a little brighter from some wall points than from others …
-UNEVEN = 0.1  # … by so much (rms over the wall): normals, relief and hidden sides are not known better
+# Of the scene. Each looks brighter from some wall points than from others: normals, relief and hidden
+# sides are not known exactly.
+PATCHES = 32
 CHUNK = 1 << 25  # elements of a batch's columns
 
 
@@ -47,6 +49,7 @@ class Problem:
         expected: ``[S, bins]`` μ.
         nuisance: ``[S·bins, P]`` X.
         prior: ``[P]`` precision of each nuisance column's coefficient.
+        uneven: ``[S·bins, Q]`` U, in units of a patch's own light (rms over the wall).
         residual: ``[S·bins]``.
         transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
     """
@@ -58,6 +61,7 @@ class Problem:
     expected: Tensor
     nuisance: Tensor
     prior: Tensor
+    uneven: Tensor
     residual: Tensor
     transients: Tensor
 
@@ -94,7 +98,6 @@ def build_problem(
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m, first = len(model), model.gate[0]
     towards, patch, coarse = towards_wall(model), patches_of(model, patches or m), patches_of(model, PATCHES)
-    n_patches = int(patch.max()) + 1
     size = max(1, CHUNK // (model.n_bins * (3 * m + 8 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
@@ -111,17 +114,17 @@ def build_problem(
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]
     more = [effect_columns(model, extension, spots, e, shapes=True, transients=transients) for e in accepted]
-    nuisance = torch.cat([torch.cat(surfels), torch.cat(others), *more], 1)
-    weight = expected.reshape(-1).rsqrt()
-    nuisance *= weight[:, None]
-    residual = (counts - expected).reshape(-1) * weight
+    weight = expected.reshape(-1, 1).rsqrt()
+    number = 2 * (int(patch.max()) + 1) + 2 * (int(coarse.max()) + 1)
+    nuisance = torch.cat([torch.cat([s[:, :number] for s in surfels]), torch.cat(others), *more], 1)
+    nuisance *= weight
+    uneven = torch.cat([s[:, number:] for s in surfels]) * weight
+    residual = ((counts - expected).reshape(-1, 1) * weight)[:, 0]
     prior = torch.zeros(nuisance.shape[1])
-    uneven = towards.shape[1] * (int(coarse.max()) + 1)
-    prior[2 * n_patches : 2 * n_patches + uneven] = 1 / UNEVEN**2
     if accepted:
         own = torch.cat([e.precision() for e in accepted])
         prior[len(prior) - len(own) :] = own
-    return Problem(model, extension, spots, counts, expected, nuisance, prior, residual, transients)
+    return Problem(model, extension, spots, counts, expected, nuisance, prior, uneven, residual, transients)
 
 
 def effect_columns(
@@ -281,11 +284,11 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
 def _transient_columns(
     model: SurfelModel, extension: Extension, spots: Tensor, towards: Tensor, patch: Tensor, coarse: Tensor
 ) -> Tensor:
-    """``[B, T, 2N + P·(J + 2)]`` derivatives of the transients.
+    """``[B, T, 2N + P·(2 + J)]`` derivatives of the transients.
 
-    By albedos (in units of themselves) and depths (in bins) of the N groups ``patch`` ``[M]``, by how much
-    brighter each of the P groups ``coarse`` ``[M]`` is where each of the J functions ``towards`` ``[B, J]``
-    of the wall point is 1, and by its moves along x and y (in bins).
+    By albedos (in units of themselves) and depths (in bins) of the N groups ``patch`` ``[M]``, by moves along
+    x and y (in bins) of the P groups ``coarse`` ``[M]``, and by how much brighter each of these is where each
+    of the J functions ``towards`` ``[B, J]`` of the wall point is 1.
     """
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
@@ -315,11 +318,11 @@ def _transient_columns(
         _scatter_columns(values, first, model.n_bins, patch)
         for values in (brighter[..., None] * weights, moving(zero, one, still))
     ]
-    light = _scatter_columns(energy[..., None] * weights, first, model.n_bins, coarse)
-    blocks.append((light[..., None] * towards[:, None, None, :]).flatten(2))
     for axis in torch.eye(2).to(still):
         values = moving(zero, zero, axis.expand_as(still))
         blocks.append(_scatter_columns(values, first, model.n_bins, coarse))
+    light = _scatter_columns(energy[..., None] * weights, first, model.n_bins, coarse)
+    blocks.append((light[..., None] * towards[:, None, None, :]).flatten(2))
     return torch.cat(blocks, 2)
 
 

@@ -26,7 +26,6 @@ from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.criticise import copy_effects
 from nlos_lit.inference.evidence import Projector
 from nlos_lit.inference.problem import (
-    UNEVEN,
     acting_order,
     build_problem,
     effect_columns,
@@ -115,10 +114,9 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     # A surfel that is brighter by f at a spot changes that spot as much as one whose albedo is.
     towards = towards_wall(model)[spots]
     j = towards.shape[1]
-    uneven = ours[:, 2 * m : (2 + j) * m].reshape(4, 58, m, j)
+    uneven = (problem.uneven * expected.reshape(-1, 1).sqrt()).reshape(4, 58, m, j)
     everywhere = (ours[:, :m] * albedo / size).view(4, 58, m, 1)
     assert torch.allclose(uneven, everywhere * towards[:, None, None, :], rtol=1e-9)
-    ours = torch.cat([ours[:, : 2 * m], ours[:, (2 + j) * m :]], 1)
     assert ours.shape == (4 * 58, len(changes))
     for k, change in enumerate(changes):
         rounded = k >= 4 * m
@@ -129,13 +127,13 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     assert torch.allclose(problem.residual, ((counts - expected) / expected.sqrt()).reshape(-1))
     free = build_problem(model, extension, spots, counts, with_effects=False)
     parameters = sum(e.declared[p].size for e in extension.effects for p in e.declared)
-    assert free.nuisance.shape[1] == len(changes) + j * m - parameters
+    assert free.nuisance.shape[1] == len(changes) - parameters
     assert torch.equal(free.nuisance, problem.nuisance[:, : free.nuisance.shape[1]])
 
 
 def test_patches_look_uneven_from_the_wall():
-    """56 surfels are 32 patches; each may be brighter by a twentieth along five functions of the wall point,
-    of mean 0 and mean square 1 over the scan; along ten where laser and sensor both move.
+    """56 surfels are 32 patches; each may be brighter along five functions of the wall point, of mean 0 and
+    mean square 1 over the scan; along ten where laser and sensor both move.
     """
     for kind, number in (("confocal", 5), ("exhaustive", 10)):
         model, extension, _, spots = setting(kind, number=56)
@@ -144,9 +142,8 @@ def test_patches_look_uneven_from_the_wall():
         assert torch.allclose(towards.mean(0), torch.zeros(number, dtype=towards.dtype), atol=1e-9)
         assert torch.allclose(towards.square().mean(0), torch.ones(number, dtype=towards.dtype))
         problem = build_problem(model, extension, spots, torch.zeros(4, 58))
-        uneven = torch.zeros(2 * m + 32 * (number + 2) + 5)
-        uneven[2 * m : 2 * m + 32 * number] = 1 / UNEVEN**2
-        assert torch.allclose(problem.prior, uneven)
+        assert problem.uneven.shape == (4 * 58, 32 * number)
+        assert torch.equal(problem.prior, torch.zeros(2 * m + 32 * 2 + 5))
 
 
 def test_batches_of_spots_change_nothing(monkeypatch):

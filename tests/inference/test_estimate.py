@@ -18,9 +18,10 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
 from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Trial, Turn
+from nlos_lit.inference.evidence import UNEVENNESS, Projector
 from nlos_lit.inference.heldout import Comparison
 from nlos_lit.inference.pool import Candidate
-from nlos_lit.inference.problem import build_problem, weighted_columns
+from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.residuals import SIDE
 from nlos_lit.inference.split import split_spots
 from nlos_lit.inference.toys import Null
@@ -122,22 +123,30 @@ def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, 
     return fit, spots, block
 
 
+def width(problem: Problem) -> float:
+    """How uneven patches look; no matter how it is found, errors are those of a scene that is so uneven."""
+    projector = Projector(problem)
+    return float(UNEVENNESS[projector.width])
+
+
 def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Effects' block of the inverse of the whole information matrix; their columns and the residual off the
     nuisance, the rows of its prior below the others; and what the prior lets the counts do.
     """
     problem = build_problem(fit.model, fit.extension, spots, fit.counts, with_effects=False)
     z = torch.cat([weighted_columns(problem, e) for e in fit.extension.effects], 1).double()
-    held = problem.prior > 0
-    below = torch.diag(problem.prior.double().sqrt())[held]
-    x = torch.cat([problem.nuisance.double(), below])
+    prior = torch.cat([problem.prior, torch.full((problem.uneven.shape[1],), width(problem) ** -2)]).double()
+    held = prior > 0
+    below = torch.diag(prior.sqrt())[held]
+    columns = torch.cat([problem.nuisance, problem.uneven], 1).double()
+    x = torch.cat([columns, below])
     own = torch.cat([z, problem.residual.double()[:, None]], 1)
     own = torch.cat([own, torch.zeros(len(below), 3, dtype=own.dtype)])
     both = torch.cat([x, own[:, :2]], 1)
     information = both.T @ both
     inverse = torch.linalg.inv(information)[-2:, -2:]
     off = own - x @ torch.linalg.solve(information[:-2, :-2], x.T @ own)
-    may = problem.nuisance[:, held].double() * problem.prior[held].double().rsqrt()
+    may = columns[:, held] * prior[held].rsqrt()
     return inverse, off[:, :2], off[:, 2], may
 
 

@@ -19,9 +19,11 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.inference import evidence as evidence_module
 from nlos_lit.inference import pool
 from nlos_lit.inference.evidence import (
+    UNEVENNESS,
     VARIANCES,
     Evidence,
     Projector,
+    best_evidence,
     evidence,
     half_products,
     prior_deviations,
@@ -208,6 +210,72 @@ def test_a_prior_counts_once():
     assert torch.allclose(off.T @ projector.residual.double(), score, atol=1e-3)
 
 
+def marginal(r: Tensor, x: Tensor, wide: list[tuple[Tensor, float]]) -> float:
+    """Log marginal likelihood of counts, up to a constant: flat over ``x``, and a random effect for each of
+    ``wide`` with its deviation.
+    """
+    cov = torch.eye(ROWS).double() + sum(u**2 * (w @ w.T).double() for w, u in wide)
+    inverse = torch.linalg.inv(cov)
+    x, r = x.double(), r.double()
+    free = inverse - inverse @ x @ torch.linalg.solve(x.T @ inverse @ x, x.T @ inverse)
+    return float(-0.5 * r @ free @ r - 0.5 * torch.logdet(cov) - 0.5 * torch.logdet(x.T @ inverse @ x))
+
+
+UNEVEN_ROWS = normal(ROWS, 20, seed=31)
+
+
+def test_unevenness_is_what_the_counts_ask_for():
+    """Against the marginal likelihood of the counts; left is what a prior of that width leaves."""
+    x, w, r = normal(ROWS, 5, seed=1), UNEVEN_ROWS, normal(ROWS, seed=2)
+    r = r + w @ (0.2 * normal(20, seed=3))
+    projector = Projector(problem(r, x, uneven=w))
+    nats = [marginal(r, x, [(w, u)]) for u in UNEVENNESS]
+    assert projector.width == int(np.argmax(nats))
+    assert 0.1 < UNEVENNESS[projector.width] < 0.4
+    assert projector.levels.numpy() == pytest.approx(np.array(nats) - max(nats), abs=2e-3)
+    precision = torch.cat([torch.zeros(5), torch.full((20,), UNEVENNESS[projector.width] ** -2.0)])
+    known, z = Projector(problem(r, torch.cat([x, w], 1), precision)), normal(ROWS, 2, seed=5)
+    assert torch.allclose(projector.off(z), known.off(z), atol=1e-4)
+    assert torch.allclose(projector.residual, known.residual, atol=1e-4)
+
+
+def test_a_term_is_held_against_a_scene_that_is_as_uneven_without_it(monkeypatch):
+    """Twenty patches do the same: best τ and u together, less the best u alone, and u is then smaller."""
+    monkeypatch.setattr(evidence_module, "SEGMENTS", 1)
+    x, w = normal(ROWS, 5, seed=1), UNEVEN_ROWS
+    z = w.sum(1, keepdim=True)
+    r = 0.15 * z[:, 0] + w @ (0.02 * normal(20, seed=3)) + normal(ROWS, seed=2)
+    projector, unit = Projector(problem(r, x, uneven=w)), torch.ones(1).double()
+    one = torch.zeros(SPOTS, dtype=torch.long)
+    found = best_evidence(projector, z.view(SPOTS, BINS, 1), projector.free(z), one, unit)
+    assert found.scatter == 1
+    alone = max(marginal(r, x, [(w, u)]) for u in UNEVENNESS)
+    some = range(0, len(VARIANCES), 2)
+    both = {
+        (k, j): marginal(r, x, [(w, UNEVENNESS[k]), (z, VARIANCES[j] ** 0.5)])
+        for k in range(24)
+        for j in some
+    }
+    width, _ = max(both, key=lambda at: both[at])
+    assert found.nats == pytest.approx(max(both.values()) - alone, abs=0.1)
+    assert found.nats > 10
+    assert projector.width_beside(projector.free(z), unit) == width < projector.width
+
+
+def test_patches_that_differ_leave_no_evidence_for_what_they_share():
+    """The same sum over patches, but each patch its own: that is what a scene does."""
+    w, unit = UNEVEN_ROWS, torch.ones(1).double()
+    z = w.sum(1, keepdim=True)
+    found = []
+    for own in (0.0, 0.3):
+        each = own * normal(20, seed=3)
+        r = w @ (each - each.mean() + 0.05) + normal(ROWS, seed=2)
+        projector = Projector(problem(r, normal(ROWS, 5, seed=1), uneven=w))
+        found.append(best_evidence(projector, z.view(SPOTS, BINS, 1), projector.free(z), BLOCK, unit).nats)
+    assert found[0] > 4 * found[1]
+    assert found[1] < 2
+
+
 @pytest.mark.parametrize("columns", [1, 4, 6, 7])
 def test_half_of_the_products_are_all(columns):
     x = normal(ROWS, columns, seed=21)
@@ -230,9 +298,14 @@ def test_a_fit_with_infinite_sensitivities_cannot_be_criticised():
         Projector(problem(torch.zeros(ROWS), x))
 
 
-def problem(residual: Tensor, nuisance: Tensor | None = None, prior: Tensor | None = None) -> Problem:
+def problem(
+    residual: Tensor,
+    nuisance: Tensor | None = None,
+    prior: Tensor | None = None,
+    uneven: Tensor | None = None,
+) -> Problem:
     x = normal(ROWS, 7, seed=1) if nuisance is None else nuisance
-    return problem_of(torch.arange(SPOTS), torch.ones(SPOTS, BINS), x, residual, prior)
+    return problem_of(torch.arange(SPOTS), torch.ones(SPOTS, BINS), x, residual, prior, uneven)
 
 
 def columns(effect: Effect, strength: float = 10.0) -> Tensor:
@@ -354,10 +427,10 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
     assert len(grid) > 2 * pool.KEPT
     period = grid[29]["period"]
-    passes, off = [], Projector.off
-    monkeypatch.setattr(Projector, "off", lambda self, z: passes.append(z.shape[1]) or off(self, z))
+    passes, free = [], Projector.free
+    monkeypatch.setattr(Projector, "free", lambda self, z: passes.append(z.shape[1]) or free(self, z))
     found = look("tcspc_nonlinearity", ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
-    assert passes == [1, 2 * pool.KEPT]  # the residual, then all columns at once
+    assert passes == [0, 1, 2 * pool.KEPT]  # unevenness, the residual, then all columns at once
     assert found.shape["period"] == period
 
 

@@ -89,7 +89,7 @@ class World:
         pool: all that is ever found.
         own: evidence of terms beside a fine scene; that of the pool where nothing is said.
         impossible: effects with which no surfel survives a rebuild.
-        misfit: nats that every fine scene leaves. taken_up: of the fitted spots, fewer.
+        misfit: nats that every fine scene leaves of select spots. taken_up: of the fitted spots, fewer.
     """
 
     def __init__(
@@ -149,7 +149,8 @@ class World:
         """The pool's turn, and its term beside a fine scene."""
         turn = self.turn()
         assert turn.best.name == name
-        return self.loop().confirm(turn, fitted(name, fine=True), fitted(fine=True))
+        loop, fine = self.loop(), fitted(name, fine=True)
+        return loop.confirm(turn, loop.own(turn, fine), fine, fitted(fine=True))
 
     def criticise(self, s: CriticismSettings = SETTINGS) -> Findings:
         return criticise(fitted(), self.rebuild, self.grow, SPLIT, SCAN, s, 4)
@@ -171,9 +172,9 @@ def test_a_larger_pool_needs_more():
 
 
 def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
-    """In 20 bins of 3 spots, 0.5 above 0.9 a bin: 15 nats, however many are looked at; never below 0."""
+    """In 20 bins of 3 spots, 0.5 above 0.9 a bin: 15 nats, however many are looked at; 0.1 below it: -3."""
     fit = SimpleNamespace(counts=torch.zeros(9, 20))
-    for deviance, nats in ((1.4, 15.0), (0.8, 0.0)):
+    for deviance, nats in ((1.4, 15.0), (0.8, -3.0)):
         found = SimpleNamespace(deviance_per_bin=deviance, deviance_noise=0.9)
         monkeypatch.setattr(loop, "score", lambda *_, found=found: found)
         assert misfit_of(fit, np.arange(7), 3) == pytest.approx(nats)
@@ -335,16 +336,16 @@ def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
         assert found.accepted is accepted
 
 
-def test_spots_that_were_not_fitted_say_what_is_accepted(monkeypatch):
-    """Of 1000 nats a scene has taken up 900 of the fitted spots: 2 nats are asked before trials, on top of
-    ln(1/level), and 20 at the end.
+def test_the_mean_of_fitted_and_other_spots_says_what_is_accepted(monkeypatch):
+    """1000 nats on select spots, and 900 fewer on fitted ones: 2 nats are asked before trials, on top of
+    ln(1/level), and 11 at the end, where noise that surfels have taken up counts once for and once against.
     """
-    for evidence, accepted in ((24.5, False), (24.7, True)):
+    for evidence, accepted in ((15.5, False), (15.7, True)):
         pool = [candidate("irf_tail", evidence)]
         world = World(monkeypatch, {"irf_tail": gaining(20.0)}, pool, misfit=1000.0, taken_up=900.0)
         found = world.confirm("irf_tail")
         assert found.needed == pytest.approx(math.log(100) + 2)
-        assert found.confirmed.needed == pytest.approx(math.log(100) + 20)
+        assert found.confirmed.needed == pytest.approx(math.log(100) + 11)
         assert found.accepted is accepted
 
 
