@@ -1,10 +1,11 @@
-"""How uneven the patches of fitted scenes truly are: what the pool's prior on them stands on.
+"""How uneven the patches of fitted scenes truly are, and how uneven the pool takes them to be.
 
     python benchmarks/uneven.py 2 4 21         development captures without effects, of scenes of our own
 
 The light of the true surface is put together by the surfel that is nearest to it, and fitted as the surfels'
 own light times 1 plus five functions of the wall point. Printed are root mean squares of their coefficients,
-weighted by light, over groups of surfels that lie together (docs/notebook.md).
+weighted by light, over groups of surfels that lie together; then what the counts alone ask for, of 32 groups,
+which is what the pool reckons with (docs/notebook.md).
 """
 
 from __future__ import annotations
@@ -69,6 +70,18 @@ def unevenness(fitted: Tensor, true: Tensor, towards: Tensor, group: Tensor) -> 
     return (total / weight) ** 0.5
 
 
+def asked(fit, split) -> float:
+    """The deviation that the pool takes 32 patches to have, from the counts."""
+    from nlos_lit.inference.evidence import UNEVENNESS, Projector
+    from nlos_lit.inference.pool import patches_for, tested_rows
+    from nlos_lit.inference.problem import build_problem
+
+    rows = tested_rows(fit, split, most=1024, seed=0)
+    counts, spots = fit.counts[rows], torch.from_numpy(split.fit[rows])
+    problem = build_problem(fit.model, fit.extension, spots, counts, patches=patches_for(counts.numel()))
+    return float(UNEVENNESS[Projector(problem).width])
+
+
 @torch.no_grad()
 def report(index: int) -> None:
     """Print one development capture's rows, of its parsimonious and of its fine scene."""
@@ -96,6 +109,7 @@ def report(index: int) -> None:
         groups = [patches_of(model, n) for n in GROUPS] + [torch.arange(len(model))]
         rows = [(int(g.max()) + 1, unevenness(*found, towards_wall(model), g)) for g in groups]
         said = ", ".join(f"{number}: {value:.3f}" for number, value in rows)
+        said += f"; asked for {asked(fit, split):.3f}"
         print(f"{index} {spec.family} {spec.scan} {spec.level:g} {name}: {said}", flush=True)
 
 

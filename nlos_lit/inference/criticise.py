@@ -62,7 +62,7 @@ class CriticismSettings:
 
     spots: int = 1024
     level: float = 0.01
-    share: float = 0.02
+    share: float = 0.1
     rivals: int = 6
     open_share: float = 0.05
     most_of: float = 0.9

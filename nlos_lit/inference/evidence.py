@@ -110,7 +110,15 @@ class Projector:
         return torch.cat([columns - self.nuisance @ weights, -self.strength * weights[self.held]])
 
     def even(self, z: Tensor, width: int) -> Tensor:
-        """``[N + H + Q, k]``: :meth:`free` columns without what patches do that are so uneven."""
+        """Without what patches do that look uneven.
+
+        Args:
+            z: ``[N + H, k]`` :meth:`free` columns.
+            width: how uneven, an index of ``UNEVENNESS``.
+
+        Returns:
+            ``[N + H + Q, k]``.
+        """
         variance = self.variances[width]
         shrink = variance / (1 + variance * self.values)
         weights = (self.axes @ (shrink[:, None] * self._along(z))).float()
@@ -127,9 +135,14 @@ class Projector:
         return self.residuals[width]
 
     def width_beside(self, z: Tensor, deviation: Tensor) -> int:
-        """Which of ``UNEVENNESS`` the counts ask for beside a term of :meth:`free` columns ``z``.
+        """How uneven patches look beside a term.
 
-        ``deviation`` ``[k]`` is C^½.
+        Args:
+            z: ``[N + H, k]`` :meth:`free` columns of the term.
+            deviation: ``[k]`` C^½.
+
+        Returns:
+            which of ``UNEVENNESS`` the counts ask for.
         """
         across, scale = self._along(z) * deviation, torch.outer(deviation, deviation)
         shrink = self.variances[:, None] / (1 + self.variances[:, None] * self.values)

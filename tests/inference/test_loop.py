@@ -337,15 +337,15 @@ def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
 
 
 def test_the_mean_of_fitted_and_other_spots_says_what_is_accepted(monkeypatch):
-    """1000 nats on select spots, and 900 fewer on fitted ones: 2 nats are asked before trials, on top of
-    ln(1/level), and 11 at the end, where noise that surfels have taken up counts once for and once against.
+    """1000 nats on select spots, and 900 fewer on fitted ones: a tenth of 100 is asked before trials, on top
+    of ln(1/level), and of 550 at the end, where noise that surfels took up counts once for and once against.
     """
-    for evidence, accepted in ((15.5, False), (15.7, True)):
+    for evidence, accepted in ((59.5, False), (59.7, True)):
         pool = [candidate("irf_tail", evidence)]
         world = World(monkeypatch, {"irf_tail": gaining(20.0)}, pool, misfit=1000.0, taken_up=900.0)
         found = world.confirm("irf_tail")
-        assert found.needed == pytest.approx(math.log(100) + 2)
-        assert found.confirmed.needed == pytest.approx(math.log(100) + 11)
+        assert found.needed == pytest.approx(math.log(100) + 10)
+        assert found.confirmed.needed == pytest.approx(math.log(100) + 55)
         assert found.accepted is accepted
 
 
@@ -369,7 +369,7 @@ def test_what_is_next_best_is_asked_in_place_of_what_is_refused(monkeypatch, evi
     """If the pool asks for it: the bar is 5.3 + 5.3. A term that only its gain speaks for ends the turn."""
     table = {"irf_tail": gaining(40.0), "pile_up": gaining(20.0, seed=1)}
     pool = [candidate("irf_tail", 300.0), candidate("pile_up", evidence)]
-    found = World(monkeypatch, table, pool, own={"irf_tail": 1.0, "pile_up": own}, misfit=265.0)
+    found = World(monkeypatch, table, pool, own={"irf_tail": 1.0, "pile_up": own}, misfit=53.0)
     turns = found.criticise().turns
     assert [t.best.name for t in turns if t.accepted] == names
     first = turns[0]
@@ -385,7 +385,7 @@ def test_what_is_next_best_is_asked_in_place_of_what_is_refused(monkeypatch, evi
 def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misfit(
     monkeypatch, evidence, named
 ):
-    """ln(2/level) = 5.3, beside a misfit of 10 000 nats, of which a map would need 200."""
+    """ln(2/level) = 5.3, beside a misfit of 10 000 nats, of which a map would need 1000."""
     monkeypatch.setattr(loop, "solve", lambda *_: None)
     pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence)]
     table = {"timing_jitter": gaining(20.0), "wall_reflectance": gaining(40.0, seed=1)}
