@@ -313,9 +313,9 @@ class Loop:
         bars = {c.name: needed(candidates, s, misfit, c.effect) for c in candidates}
         asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
         turn = Turn(candidates, needed(candidates, s, misfit), asked)
-        if not any(c.loud > bars[c.name] for c in candidates):
+        rivals = leaders([c for c in candidates if c.loud > bars[c.name]], s.rivals)
+        if not rivals:
             return turn
-        rivals = leaders(candidates, s.rivals)
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
@@ -567,20 +567,19 @@ def leaders(candidates: list[Candidate], number: int) -> list[Candidate]:
     linear step towards a strong effect leaves an error that scatters like a misfit.
 
     Args:
-        candidates: most evidence first.
+        candidates: that have what they need, if all of the scatter is theirs; most evidence first.
         number: of effects that are the same law at all spots; the best free term and the best with a number
             for each spot come on top.
 
     Returns:
         those, most evidence first.
     """
-    asked = [c for c in candidates if c.loud > 0]
-    laws = [c for c in asked if is_law(c)]
+    laws = [c for c in candidates if is_law(c)]
     tried = laws[: number // 2]
     rest = [c for c in laws if c not in tried]
     tried += sorted(rest, key=lambda c: -c.loud)[: number - len(tried)]
-    tried += [c for c in asked if c.name in FREE_NAMES and not c.effect.per_spot][:1]
-    tried += [c for c in asked if c.effect.per_spot][:1]
+    tried += [c for c in candidates if c.name in FREE_NAMES and not c.effect.per_spot][:1]
+    tried += [c for c in candidates if c.effect.per_spot][:1]
     return sorted(tried, key=lambda c: -c.evidence)
 
 
