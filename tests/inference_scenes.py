@@ -156,8 +156,9 @@ def problem_of(
     """A least-squares problem without a model behind it."""
     prior = torch.zeros(nuisance.shape[1]) if prior is None else prior
     uneven = torch.zeros(len(nuisance), 0) if uneven is None else uneven
+    lit = torch.ones(len(nuisance))
     given = {"extension": Extension([]), "spots": spots, "counts": expected, "expected": expected}
-    given |= {"nuisance": nuisance, "residual": residual, "prior": prior, "uneven": uneven}
+    given |= {"nuisance": nuisance, "residual": residual, "prior": prior, "uneven": uneven, "lit": lit}
     return Problem(**{f.name: given.get(f.name) for f in dataclasses.fields(Problem)})
 
 
@@ -175,11 +176,11 @@ def fit_of(
     return SurfelFit(*known, extension, generator, order)
 
 
-def candidate(name: str, evidence: float = 100.0) -> Candidate:
+def candidate(name: str, evidence: float = 100.0, lit: float = 1.0) -> Candidate:
     """What the pool might have found, on a capture of twelve spots; nothing scatters."""
     effect = effect_of(name, Scan.of(capture_of(scattered(12))))
     size = sum(p.size for p in effect.amplitudes)
-    return Candidate(effect, evidence, 0.5, 1.0, {}, torch.zeros(size), torch.ones(size), evidence)
+    return Candidate(effect, evidence, 0.5, 1.0, {}, torch.zeros(size), torch.ones(size), evidence, lit)
 
 
 def per_spot(mean: float, scatter: float, seed: int = 0) -> Tensor:

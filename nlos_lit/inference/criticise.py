@@ -25,7 +25,7 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
-from nlos_lit.inference.per_spot import solve, sparse
+from nlos_lit.inference.per_spot import solve
 from nlos_lit.inference.pool import Candidate, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
@@ -47,8 +47,8 @@ class CriticismSettings:
         spots: fitted spots that the pool is asked on at most.
         level: chance of a false name that is borne where the base is right: a term needs ln(terms in the
             pool/level) nats of evidence.
-        share: of the misfit that a fine scene leaves, nats; a term needs so much on top. What is wrong for
-            unknown reasons may look a little like anything.
+        share: of the misfit that a fine scene leaves, nats; a term needs so much on top, as far as it acts
+            where the scene's light falls. What is wrong for unknown reasons may look a little like anything.
         rivals: effects with which the fit goes on in a turn, besides the best free term and the best with a
             number for each spot.
         open_share: weight above which the capture leaves something open: that nothing is to be named, in the
@@ -168,23 +168,20 @@ class Findings:
         return [t for t in self.turns if t.accepted and t.best is not None and t.best.name in kept]
 
 
-def needed(
-    candidates: list[Candidate], s: CriticismSettings, misfit: float, effect: Effect | None = None
-) -> float:
+def needed(candidates: list[Candidate], s: CriticismSettings, misfit: float, lit: float = 1.0) -> float:
     """Nats that a term of this pool needs.
 
     Args:
         candidates: the pool.
         s: settings.
         misfit: nats, see :func:`misfit_of`.
-        effect: the term; None for one that a misfit may look like. What single spots have over their
-            neighbours it does not look like: a scene is seen alike from neighbouring points.
+        lit: how far a misfit of the scene may look like the term, see
+            :class:`~nlos_lit.inference.pool.Candidate`.
 
     Returns:
-        ln(terms/level) and, where the misfit counts, the settings' share of it.
+        ln(terms/level) and, as far as it may be the scene's, the settings' share of the misfit.
     """
-    own = effect is not None and effect.per_spot and not sparse(effect)
-    return math.log(len(candidates) / s.level) + (0.0 if own else s.share * misfit)
+    return math.log(len(candidates) / s.level) + s.share * lit * misfit
 
 
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
@@ -310,7 +307,7 @@ class Loop:
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
         misfit = self._misfit(fine, self.split.fit)  # before it is in the model, a term is part of it itself
-        bars = {c.name: needed(candidates, s, misfit, c.effect) for c in candidates}
+        bars = {c.name: needed(candidates, s, misfit, c.lit) for c in candidates}
         asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
         turn = Turn(candidates, needed(candidates, s, misfit), asked)
         rivals = leaders([c for c in candidates if c.loud > bars[c.name]], s.rivals)
@@ -367,10 +364,10 @@ class Loop:
         s, name = self.settings, turn.best.name
         own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
         tried = "" if turn.confirmed is None else "_again"
-        nats = self.steps("screen", f"asking for {name} again", f"turn{self.number}_own_{name}{tried}", own)
+        text, kept = f"asking for {name} again", f"turn{self.number}_own_{name}{tried}"
+        nats, lit = self.steps("screen", text, kept, own)
         misfit = self._misfit(fine, self.split.fit, self.split.select)
-        effect = next(e for e in fine.extension.effects if e.name == name)
-        return nats, needed(turn.candidates, s, misfit, effect)
+        return nats, needed(turn.candidates, s, misfit, lit)
 
     def confirm(self, turn: Turn, own: tuple[float, float], fine: SurfelFit, without: SurfelFit) -> Turn:
         """Is the turn's best term still asked for beside a fine scene?

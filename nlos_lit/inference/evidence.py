@@ -91,7 +91,7 @@ class Projector:
                 gram + torch.diag(problem.prior.double() + ridge * diagonal)
             )
             ridge *= 10
-        self.nuisance, self.held = x, problem.prior.nonzero()[:, 0]
+        self.nuisance, self.lit, self.held = x, problem.lit, problem.prior.nonzero()[:, 0]
         self.strength = problem.prior[self.held, None].sqrt()
         self.uneven, self.left = self.free(problem.uneven), self.free(problem.residual[:, None])
         values, self.axes = torch.linalg.eigh((self.uneven.T @ self.uneven).double())
@@ -194,6 +194,7 @@ class Evidence:
         retained: share of the term's information that the base cannot imitate.
         scatter: φ, mean over the directions weighted by their scores.
         loud: nats if all of the scatter were the term's own.
+        lit: share of what is left of its information that lies where the scene's light falls.
     """
 
     nats: float
@@ -203,6 +204,7 @@ class Evidence:
     retained: float
     scatter: float
     loud: float
+    lit: float = 1.0
 
 
 def prior_deviations(effect: Effect) -> Tensor:
@@ -311,9 +313,11 @@ def best_evidence(
     """
     found = []
     for width in sorted({projector.width, projector.width_beside(z, deviation)}):
-        one = evidence(raw, projector.even(z, width), projector.residual_at(width), block, deviation, bounds)
-        level = float(projector.levels[width])
-        found.append(replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)))
+        off, level = projector.even(z, width), float(projector.levels[width])
+        one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds)
+        told = (off[: len(projector.lit)] * deviation.float()).square().sum(1).double()
+        lit = float(told @ projector.lit.double() / told.sum().clamp_min(1e-30))
+        found.append(replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level), lit=lit))
     return max(found, key=lambda one: one.nats)
 
 

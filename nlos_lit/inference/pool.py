@@ -48,6 +48,9 @@ class Candidate:
         step: ``[k]`` change of the stored amplitudes that the counts ask for. error: of it.
         loud: nats if all of the scatter were the term's own, as it is of a strong one: one linear step leaves
             an error that scatters like a misfit.
+        lit: how far a misfit of the scene may look like it: the share of its information that lies where the
+            scene's light falls; 0 of what single spots have over their neighbours, since a scene is seen
+            alike from neighbouring points.
     """
 
     effect: Effect
@@ -58,6 +61,7 @@ class Candidate:
     step: Tensor = field(repr=False)
     error: Tensor = field(repr=False)
     loud: float
+    lit: float = 1.0
 
     @property
     def name(self) -> str:
@@ -126,7 +130,7 @@ def ask(fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int) -> list[
     return screen(problem, [e(scan) for e in [*EFFECTS, *FREE] if e.name not in have], block)
 
 
-def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) -> float:
+def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) -> tuple[float, float]:
     """How much the counts ask for a term that a fit has, beside all else that the fit has and may do.
 
     Args:
@@ -137,7 +141,7 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
         name: of the term.
 
     Returns:
-        nats, as of a candidate.
+        nats and ``lit``, as of a candidate.
     """
     effect = next(e for e in fit.extension.effects if e.name == name)
     problem, block = _problem(fit, split, most, seed, without=effect)
@@ -150,11 +154,19 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
     if effect.per_spot:
         column = columns[:, 0].view(problem.expected.shape)
         score, information, _ = _scores(problem, Projector(problem), effect, column, at[problem.spots])
-        return best_width(score, information, sparse(effect))[0] - math.log(shapes)
+        nats = best_width(score, information, sparse(effect))[0]
+        return nats - math.log(shapes), _lit(problem, effect, column)
     projector = Projector(replace(problem, residual=problem.residual + columns @ at))
-    return _evidence(problem, projector, effect, columns, projector.free(columns), block).nats - math.log(
-        shapes
-    )
+    found = _evidence(problem, projector, effect, columns, projector.free(columns), block)
+    return found.nats - math.log(shapes), found.lit
+
+
+def _lit(problem: Problem, effect: Effect, column: Tensor) -> float:
+    """Of a term with a number for each spot, whose columns ``[S, T]`` these are."""
+    if not sparse(effect):
+        return 0.0
+    told = column.square().flatten().double()
+    return float(told @ problem.lit.double() / told.sum().clamp_min(1e-30))
 
 
 def _amplitudes(effect: Effect) -> Tensor:
@@ -217,7 +229,15 @@ def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate
     if bool(effect.precision().any()) and best.scale:
         effect.prior_scale = best.scale
     return Candidate(
-        effect, mean, best.retained, best.scatter, shape, best.step, best.error, max(mean, best.loud)
+        effect,
+        mean,
+        best.retained,
+        best.scatter,
+        shape,
+        best.step,
+        best.error,
+        max(mean, best.loud),
+        best.lit,
     )
 
 
@@ -289,16 +309,17 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
         gain, width, share = best_width(score, information, sparse(effect))
         nats.append(gain)
         if best is None or gain > best[0]:
-            best = gain, width, share, shape, score, information, scatter
+            best = gain, width, share, shape, score, information, scatter, column
     assert best is not None
-    _, effect.width, effect.share, shape, score, information, scatter = best
+    _, effect.width, effect.share, shape, score, information, scatter, column = best
     effect.set_all(shape)
     full = torch.zeros(len(problem.model.laser))
     full[problem.spots] = coefficients(score, information, effect.width, sparse(effect)).float()
     error = torch.full_like(full, float("nan"))
     error[problem.spots] = information.rsqrt().float()
     nats_of_all = mean_factor(nats, len(shapes))
-    return Candidate(effect, nats_of_all, 1.0, scatter, shape, full, error, nats_of_all)
+    lit = _lit(problem, effect, column)
+    return Candidate(effect, nats_of_all, 1.0, scatter, shape, full, error, nats_of_all, lit)
 
 
 def _scores(

@@ -50,6 +50,7 @@ class Problem:
         nuisance: ``[S·bins, P]`` X.
         prior: ``[P]`` precision of each nuisance column's coefficient.
         uneven: ``[S·bins, Q]`` U, in units of a patch's own light (rms over the wall).
+        lit: ``[S·bins]`` share of the expected counts that is the scene's light.
         residual: ``[S·bins]``.
         transients: ``[S, T]`` light on arrival, which response, spot and counting effects start from.
     """
@@ -62,6 +63,7 @@ class Problem:
     nuisance: Tensor
     prior: Tensor
     uneven: Tensor
+    lit: Tensor
     residual: Tensor
     transients: Tensor
 
@@ -124,7 +126,16 @@ def build_problem(
     if accepted:
         own = torch.cat([e.precision() for e in accepted])
         prior[len(prior) - len(own) :] = own
-    return Problem(model, extension, spots, counts, expected, nuisance, prior, uneven, residual, transients)
+    given = (model, extension, spots, counts, expected, nuisance, prior, uneven)
+    return Problem(*given, _lit(model, extension, spots, transients), residual, transients)
+
+
+@torch.no_grad()
+def _lit(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
+    """``[S·bins]`` scene's light over all light, before what counts it."""
+    light = extension.gain(model.signal(transients, extension), spots)
+    background = extension.background(model.laser_sensor.background(), spots)
+    return (light / (light + background).clamp_min(1e-9))[:, model.gate[0] :].clamp(0.0, 1.0).reshape(-1)
 
 
 def effect_columns(

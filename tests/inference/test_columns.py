@@ -125,6 +125,8 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
         tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
         assert float((ours[:, k] - numeric).abs().max()) < tolerance, f"column {k}"
     assert torch.allclose(problem.residual, ((counts - expected) / expected.sqrt()).reshape(-1))
+    assert problem.lit.shape == (4 * 58,)
+    assert 0 <= float(problem.lit.min()) < float(problem.lit.max()) <= 1
     free = build_problem(model, extension, spots, counts, with_effects=False)
     parameters = sum(e.declared[p].size for e in extension.effects for p in e.declared)
     assert free.nuisance.shape[1] == len(changes) - parameters

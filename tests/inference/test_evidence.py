@@ -276,6 +276,17 @@ def test_patches_that_differ_leave_no_evidence_for_what_they_share():
     assert found[1] < 2
 
 
+def test_a_misfit_of_the_scene_lies_where_its_light_falls():
+    """A term that acts on the dark third of the bins alone, on all alike, or on the lit ones."""
+    whole, unit = problem(normal(ROWS, seed=2), normal(ROWS, 2, seed=1)), torch.ones(1).double()
+    whole.lit = (torch.arange(BINS) >= BINS // 3).float().repeat(SPOTS)
+    projector = Projector(whole)
+    for z, lit in ((1 - whole.lit, 0.0), (torch.ones(ROWS), 2 / 3), (whole.lit, 1.0)):
+        column = z.view(ROWS, 1)
+        found = best_evidence(projector, column.view(SPOTS, BINS, 1), projector.free(column), BLOCK, unit)
+        assert found.lit == pytest.approx(lit, abs=0.03)
+
+
 @pytest.mark.parametrize("columns", [1, 4, 6, 7])
 def test_half_of_the_products_are_all(columns):
     x = normal(ROWS, columns, seed=21)
@@ -499,6 +510,7 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     assert np.corrcoef(found.step[2:-1], delta)[0, 1] > 0.9
     assert found.error[5].item() == pytest.approx(information**-0.5, rel=1e-4)
     assert torch.isnan(found.error[0])
+    assert found.lit == 0, "no misfit of a scene differs from spot to spot"
     slope = wall(SPOTS).laser.sum(1).repeat_interleave(BINS)
     calm = problem(0.8 * normal(ROWS, seed=14) + 0.3 * slope, nuisance)
     calm.model = wall(SPOTS)

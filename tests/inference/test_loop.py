@@ -123,10 +123,13 @@ class World:
         self.asked.append(fit.fine)
         return [*(c for c in self.pool if c.name not in fit.names), *DUD[: len(fit.names)]]
 
-    def own_evidence(self, fit: FakeFit, split: object, most: int, seed: int, name: str) -> float:
+    def own_evidence(
+        self, fit: FakeFit, split: object, most: int, seed: int, name: str
+    ) -> tuple[float, float]:
         assert name in fit.names
         assert fit.fine
-        return self.own.get(name, next(c.evidence for c in self.pool if c.name == name))
+        found = next(c for c in self.pool if c.name == name)
+        return self.own.get(name, found.evidence), found.lit
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
         fit = FakeFit(extension, seed, anew=True)
@@ -167,8 +170,8 @@ def test_a_larger_pool_needs_more():
     assert needed(pool[:1], CriticismSettings(level=0.1), 0.0) == pytest.approx(math.log(10))
     s = CriticismSettings(share=0.1)
     assert needed(pool, s, 500.0) == pytest.approx(math.log(4000) + 50)
-    for name, share in (("irf_tail", 50), ("hot_spots", 50), ("timing_jitter", 0), ("free_spot_gain", 0)):
-        assert needed(pool, s, 500.0, candidate(name).effect) == pytest.approx(math.log(4000) + share), name
+    for lit, share in ((1.0, 50), (0.2, 10), (0.0, 0)):
+        assert needed(pool, s, 500.0, lit) == pytest.approx(math.log(4000) + share)
 
 
 def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
@@ -387,7 +390,7 @@ def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misf
 ):
     """ln(2/level) = 5.3, beside a misfit of 10 000 nats, of which a map would need 1000."""
     monkeypatch.setattr(loop, "solve", lambda *_: None)
-    pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence)]
+    pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence, 0.0)]
     table = {"timing_jitter": gaining(20.0), "wall_reflectance": gaining(40.0, seed=1)}
     found = World(monkeypatch, table, pool, misfit=10_000.0).criticise()
     assert [t.best.name for t in found.accepted] == (["timing_jitter"] if named else [])
