@@ -315,10 +315,27 @@ def best_evidence(
     for width in sorted({projector.width, projector.width_beside(z, deviation)}):
         off, level = projector.even(z, width), float(projector.levels[width])
         one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds)
-        told = (off[: len(projector.lit)] * deviation.float()).square().sum(1).double()
-        lit = float(told @ projector.lit.double() / told.sum().clamp_min(1e-30))
+        lit = lit_share(off[: len(projector.lit)] * deviation.float(), projector.lit)
         found.append(replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level), lit=lit))
     return max(found, key=lambda one: one.nats)
+
+
+def lit_share(columns: Tensor, lit: Tensor) -> float:
+    """Share of a term's information that lies where the scene's light falls.
+
+    Args:
+        columns: ``[N, k]`` weighted columns.
+        lit: ``[N]`` share of the scene's light in each row.
+
+    Returns:
+        from 0 to 1.
+
+    Examples:
+        >>> round(lit_share(torch.tensor([[1.0], [2.0]]), torch.tensor([0.0, 1.0])), 3)
+        0.8
+    """
+    told = columns.square().sum(1).double()
+    return float(told @ lit.double() / told.sum().clamp_min(1e-30))
 
 
 def segments(z: Tensor, residual: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -20,6 +20,7 @@ from nlos_lit.inference.evidence import (
     Evidence,
     Projector,
     best_evidence,
+    lit_share,
     prior_deviations,
     step_bounds,
 )
@@ -163,10 +164,7 @@ def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) 
 
 def _lit(problem: Problem, effect: Effect, column: Tensor) -> float:
     """Of a term with a number for each spot, whose columns ``[S, T]`` these are."""
-    if not sparse(effect):
-        return 0.0
-    told = column.square().flatten().double()
-    return float(told @ problem.lit.double() / told.sum().clamp_min(1e-30))
+    return lit_share(column.reshape(-1, 1), problem.lit) if sparse(effect) else 0.0
 
 
 def _amplitudes(effect: Effect) -> Tensor:
