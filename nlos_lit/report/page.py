@@ -311,9 +311,9 @@ def _screened(diagnosis: Diagnosis) -> str:
         )
     heads = ["Effect", "Evidence (nats)", "Retained", "Scatter", "Coefficients", "First estimate"]
     text = (
-        f"Ranked by evidence, of which {number(diagnosis.needed)} nats are needed (fewer by what acts where the"
-        " scene sends no light, and by delays and gains of single spots: no misfit of the scene looks like"
-        " these); ✔ accepted. Evidence alone"
+        f"Ranked by evidence, of which {number(diagnosis.needed)} nats are needed (fewer by what acts where"
+        " the scene sends no light, and by delays and gains of single spots: no misfit of the scene looks"
+        " like these); ✔ accepted. Evidence alone"
         " is not enough: what is accepted also gains on other spots, and beats its rivals. Evidence:"
         " logarithm of the odds that the counts give to the term against none. Retained: what is left of its"
         " trace once scene, albedo and response have adapted. Scatter: how much more its trace varies over"
