@@ -315,9 +315,9 @@ def best_evidence(
     for width in sorted({projector.width, projector.width_beside(z, deviation)}):
         off, level = projector.even(z, width), float(projector.levels[width])
         one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds)
-        lit = lit_share(off[: len(projector.lit)] * deviation.float(), projector.lit)
-        found.append(replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level), lit=lit))
-    return max(found, key=lambda one: one.nats)
+        found.append((replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)), off))
+    best, off = max(found, key=lambda pair: pair[0].nats)
+    return replace(best, lit=lit_share(off[: len(projector.lit)] * deviation.float(), projector.lit))
 
 
 def lit_share(columns: Tensor, lit: Tensor) -> float:

@@ -133,8 +133,7 @@ def build_problem(
 @torch.no_grad()
 def _lit(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
     """``[S·bins]`` scene's light over all light, before what counts it."""
-    light = extension.gain(model.signal(transients, extension), spots)
-    background = extension.background(model.laser_sensor.background(), spots)
+    light, background = model.incident(model.signal(transients, extension), spots, extension)
     return (light / (light + background).clamp_min(1e-9))[:, model.gate[0] :].clamp(0.0, 1.0).reshape(-1)
 
 
@@ -249,7 +248,7 @@ def _staged(
     signal = model.signal(transients, extension)
     if effect.stage == "spot":
         return _Forward(model, extension, lambda m, e: m.detect(signal, spots, e))
-    light = extension.gain(signal, spots) + extension.background(model.laser_sensor.background(), spots)
+    light = torch.add(*model.incident(signal, spots, extension))
     return _Forward(model, extension, lambda m, e: e.counting(light, spots))
 
 

@@ -339,9 +339,22 @@ class SurfelModel(nn.Module):
         Returns:
             ``[B, T]`` expected counts.
         """
-        background = hooks.background(self.laser_sensor.background(), spots)
-        counted = hooks.counting(hooks.gain(signal, spots) + background, spots)
+        light, background = self.incident(signal, spots, hooks)
+        counted = hooks.counting(light + background, spots)
         return counted * self.observed[spots] if len(self.observed) else counted
+
+    def incident(self, signal: Tensor, spots: Tensor, hooks: Hooks) -> tuple[Tensor, Tensor]:
+        """What there is to be counted.
+
+        Args:
+            signal: ``[B, T]`` counts of the light.
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act on it.
+
+        Returns:
+            ``[B, T]`` light of the scene after its gain, and background that broadcasts with it.
+        """
+        return hooks.gain(signal, spots), hooks.background(self.laser_sensor.background(), spots)
 
     def record(self, transients: Tensor, spots: Tensor, hooks: Hooks) -> Tensor:
         """Stages 4 and 5.

@@ -518,6 +518,19 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     assert nothing.evidence < 0.5
 
 
+@pytest.mark.parametrize(
+    ("name", "lit"),
+    [("timing_jitter", 0.0), ("free_spot_gain", 0.0), ("hot_spots", 2 / 3), ("spot_gate", 2 / 3)],
+)
+def test_only_what_single_spots_have_over_their_neighbours_is_no_misfit(monkeypatch, name, lit):
+    """Delays and gains of single spots; what is rare may be the scene's where that sends light."""
+    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
+    whole = problem(normal(ROWS, seed=14), 1e-6 * normal(ROWS, 2, seed=13))
+    whole.model, whole.lit = wall(SPOTS), (torch.arange(BINS) >= BINS // 3).float().repeat(SPOTS)
+    (found,) = screen(whole, [effect_of(name, SCAN)], BLOCK)
+    assert found.lit == pytest.approx(lit)
+
+
 def test_a_misfit_that_changes_along_time_holds_a_map_to_account():
     """One coefficient for each of three blocks, which follows any of them. What is wrong in a block's first
     quarter alone scatters between its parts; what scales all of a block does not.
