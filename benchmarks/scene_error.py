@@ -1,0 +1,124 @@
+"""How far fitted scenes lie from the true light, and how far they would lie, had they begun on the surface.
+
+    python benchmarks/scene_error.py 2 4 21         development captures without effects
+    python benchmarks/scene_error.py 2 truth=1      also scenes begun on the true surface
+
+Printed is one JSON line a scene: the Kullback-Leibler divergence of its expected counts from the true ones,
+in nats over the fitted and over the select spots. Noise has no part in it. What stands there is what a
+missing effect must stand out from (docs/notebook.md). One thread.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind")]
+STEEP = 0.12  # cosine of the tilt beyond which the true surface is not seen from the wall
+LAYER = 2  # cells along z between two sheets
+
+
+def divergence(fit, expected: np.ndarray, spots: np.ndarray) -> float:
+    """Nats by which the true ``expected`` counts ``[S, T_gate]`` of some spots lie from the fit's."""
+    true = expected[spots].astype(np.float64)
+    own = fit.model.expected(torch.from_numpy(spots), fit.extension).double().clamp_min(1e-9).numpy()
+    return float((true * np.log(np.maximum(true, 1e-12) / own) - true + own).sum())
+
+
+def on_surface(fit, elements, parts: int):
+    """A copy of a fit, its surfels on the true surface, one a cell, ``parts`` times finer along each side.
+
+    A round of batches follows, so that albedos, response and small errors of the cells are fitted.
+    """
+    from nlos_lit.effects.extension import Extension
+    from nlos_lit.surfels.fit import rounds_of
+
+    again = fit.copy(Extension([]), 0)
+    model = again.model
+    cell = float(model.cell.max()) / parts
+    model.lateral, model.cell = model.lateral._replace(pitch=(cell, cell)), model.cell / parts
+    model.place(*cells_of(elements.of(elements.normal[:, 2] < -STEEP), cell))
+    again.match_energy()
+    again.schedule(rounds_of(again.settings.steps, 1, settle=True))
+    again.finish()
+    return again
+
+
+def cells_of(elements, cell: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Centres, normals and albedos of one surfel a lateral cell and sheet, the mean of what lies in it."""
+    index = np.round(elements.centre[:, :2] / cell).astype(int)
+    order = np.lexsort((elements.centre[:, 2], index[:, 1], index[:, 0]))
+    sorted_index, z = index[order], elements.centre[order, 2]
+    new = (np.diff(sorted_index, axis=0) != 0).any(1) | (np.diff(z) > LAYER * cell)
+    found = []
+    for rows in np.split(order, np.flatnonzero(new) + 1):
+        area = elements.area[rows]
+        normal = (elements.normal[rows] * area[:, None]).sum(0)
+        normal /= np.linalg.norm(normal)
+        whole = cell**2 / max(-normal[2], STEEP)
+        light = (elements.albedo[rows] * area).sum() / whole
+        found.append((np.average(elements.centre[rows], axis=0, weights=area), normal, light))
+    centre, normal, light = (torch.from_numpy(np.array(v)).float() for v in zip(*found, strict=True))
+    return centre, normal, light.clamp_min(1e-4)
+
+
+def scenes(pipeline, capture, split, elements):
+    """What a diagnosis fits, then fits begun on the true surface, where its elements are given."""
+    from nlos_lit.effects.extension import Extension
+
+    base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
+    yield "parsimonious", base
+    yield "fine", pipeline.grow(base, 0)
+    if elements is not None:
+        for parts in (1, 2):
+            yield f"on the true surface, cells/{parts}", on_surface(base, elements, parts)
+
+
+def report(number: int, from_truth: bool) -> None:
+    """Print one development capture's rows."""
+    from blind_judge import pipeline_for
+    from wild_truth import make
+
+    from data_modules.readers import read_capture
+    from nlos_lit.inference.heldout import score
+    from nlos_lit.inference.split import split_spots
+
+    with tempfile.TemporaryDirectory() as folder:
+        truth = make("development", number, Path(folder) / "capture.hdf5")
+        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    first, last = capture.gate
+    expected = truth.expected[:, first:last] if truth.expected.shape[1] > last - first else truth.expected
+    pipeline, split = pipeline_for(capture), split_spots(capture)
+    began = time.process_time()
+    elements = truth.scene.elements if from_truth and truth.scene.own else None
+    for what, fit in scenes(pipeline, capture, split, elements):
+        seconds, found = time.process_time() - began, score(fit, split.select)
+        row = {
+            "set": "development",
+            "number": number,
+            "family": truth.spec.family,
+            "counts_per_spot": truth.spec.level,
+            "scene": what,
+            "surfels": len(fit.model),
+            "fitted_nats": round(divergence(fit, expected, split.fit), 1),
+            "fitted_spots": len(split.fit),
+            "select_nats": round(divergence(fit, expected, split.select), 1),
+            "select_spots": len(split.select),
+            "over_noise": round(found.deviance_per_bin / found.deviance_noise, 4),
+            "cpu_seconds": round(seconds, 1),
+        }
+        print(json.dumps(row), flush=True)
+        began = time.process_time()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for wanted in (int(a) for a in sys.argv[1:] if a.isdigit()):
+        report(wanted, "truth=1" in sys.argv)
