@@ -9,11 +9,12 @@ effects=[pile_up] pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
 import logging
 import sys
 
-from nlos_lit.commands.simulate import simulate
+from nlos_lit.runtime.arguments import look_over
 from nlos_lit.runtime.command_line import sentence_errors
-
-main = sentence_errors(simulate)
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    main(sys.argv[1:])
+    look_over("simulate", sys.argv, __doc__)
+    from nlos_lit.commands.simulate import simulate  # after that: it loads torch
+
+    sentence_errors(simulate)(sys.argv[1:])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class UserError(Exception):
     """Something the user gave cannot work; the message says what was found, what was expected and what to do.
@@ -16,3 +19,24 @@ class CaptureError(UserError, ValueError):
 
 class MemoryBudgetError(UserError, MemoryError):
     """A computation needs more memory than the budget allows."""
+
+
+def suggest(name: str, known: Iterable[str]) -> str:
+    """What to write instead of a name that does not exist, as the end of a sentence.
+
+    Args:
+        name: as it was given.
+        known: the names there are.
+
+    Returns:
+        The nearest of them, or all where none is near.
+
+    Examples:
+        >>> suggest("itrations", ["threshold", "iterations"])
+        'did you mean iterations?'
+        >>> suggest("x", ["threshold", "iterations"])
+        'there are threshold, iterations'
+    """
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=3)
+    return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(names)}"

@@ -331,8 +331,8 @@ def test_the_surface_of_a_finished_run_starts_from_its_image_and_response(tmp_pa
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["run=nowhere"], "to fit the surface of a finished run give model=surface run=FOLDER"),
-        (["model=surface", "run=nowhere"], "nowhere is not the folder of a finished run"),
+        (["run=tests"], "to fit the surface of a finished run give model=surface run=FOLDER"),
+        (["model=surface", "run=tests"], "tests is not the folder of a finished run"),
         (["model=surface", "trainer=ddp"], "is fitted in one process; found trainer.devices=2"),
     ],
 )
