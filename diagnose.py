@@ -18,7 +18,9 @@ def main(config: DictConfig) -> None:
     """Open the command."""
     with begun("diagnose", config):
         from nlos_lit.commands.diagnose import diagnose
+        from nlos_lit.commands.plan import plan
 
+        plan(config)
         diagnose(config)
 
 

@@ -14,8 +14,10 @@ from nlos_lit.runtime.command_line import sentence_errors
 def main(config: DictConfig) -> None:
     """Open the command."""
     with begun("train", config):
+        from nlos_lit.commands.plan import plan
         from nlos_lit.commands.train import train
 
+        plan(config)
         train(config)
 
 

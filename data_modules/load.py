@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pooch
 
+from data_modules.plan import plan_capture
 from data_modules.readers import ReaderOptions, read_capture
 from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_truth, simulate_capture
 from nlos_lit.capture import Capture
@@ -38,6 +39,7 @@ def load_scene(
     if scene["simulate"] is not None and scene["path"] is None:
         capture, truth = _simulate(scene["simulate"], seed)
     else:
+        scene = planned_scene(scene, data_dir)[0]
         path = find_file(scene, Path(data_dir))
         capture, truth = read_capture(path, scene["format"], options=_options(scene["reader"])), None
     if scene["truth"] is not None:
@@ -46,6 +48,45 @@ def load_scene(
     if scene["gate"] is not None:
         capture = capture.with_gate(*scene["gate"])
     return capture, truth
+
+
+def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[str, Any], Capture | None]:
+    """A scene with what it leaves to its data filled in: bins to sum, gate, depths.
+
+    Args:
+        scene: a config of conf/scene; ``sum_bins`` or ``volume.depth`` may be null.
+        data_dir: folder in which downloaded files are looked for.
+
+    Returns:
+        The scene, and the capture as it will be fitted, where it had to be read.
+
+    Raises:
+        UserError: the data are not there, or show no light to plan by.
+    """
+    depth = scene["volume"]["depth"]
+    if scene["sum_bins"] is not None and depth is not None:
+        return dict(scene), None
+    path = find_file(scene, Path(data_dir))
+    capture = read_capture(path, scene["format"], options=_options(scene["reader"]))
+    capture = capture.sum_spots(scene["sum_spots"])
+    plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
+    if depth is None and plan.depth is None:
+        raise UserError(
+            f"{path.name}: no light that comes back stands out of the noise, so the depths of the volume "
+            "cannot be told from the data; give them as 'scene.volume.depth=[NEAR,FAR]' (m)"
+        )
+    volume = {**scene["volume"], "depth": list(plan.depth or ()) if depth is None else depth}
+    planned = {**scene, "sum_bins": plan.sum_bins, "gate": list(plan.gate), "volume": volume}
+    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
+    near, far = volume["depth"]
+    log.info(
+        "plan for %s: %d bins summed to %.3g ps, gate [%d, %d), depth %.3g to %.3g m, planes %.3g mm apart, "
+        "for a wavelength of %.3g cm; scene.sum_bins, scene.gate, scene.volume.depth, "
+        "scene.volume.depth_pitch and scene.wavelength override it",
+        path.name, plan.sum_bins, capture.bin_width_ps, *plan.gate, near, far,
+        1e3 * (volume["depth_pitch"] or plan.depth_pitch), 100 * plan.wavelength,
+    )  # fmt: skip
+    return planned, capture
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:

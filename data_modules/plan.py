@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from data_modules.readers.assemble import direct_pulse, gate_after_direct_pulse, smooth
 from nlos_lit.capture import Capture
@@ -14,7 +15,8 @@ from nlos_lit.capture.aperture import spot_spacing
 
 SPOTS_LOOKED_AT = 1024  # of large scans every n-th
 SAMPLES = 8  # bins a wavelength; the shortest that a fit may reach, 0.53 of it, has four (conf/model)
-PEAK, FAINT = 6, 4  # standard deviations above the floor of a spot's peak, and of light that is counted
+CHANCE = 1e-6  # that noise in a spot's gate is taken for light that comes back
+FAINT = 4  # standard deviations above the floor of light that is counted
 LIGHT = 0.99  # share of a spot's light behind which nothing is imaged
 
 
@@ -64,7 +66,12 @@ class Plan:
         return f"{gate} 'scene.volume.depth=[{self.depth[0]:.4g},{self.depth[1]:.4g}]'"
 
 
-def plan_capture(capture: Capture, wavelength: float | None = None) -> Plan:
+def plan_capture(
+    capture: Capture,
+    wavelength: float | None = None,
+    sum_bins: int | None = None,
+    gate: tuple[int, int] | None = None,
+) -> Plan:
     """Gate, summed bins and depths for a capture.
 
     Bins are summed as far as ``SAMPLES`` of them stay in a wavelength, and in the gate. The gate is the
@@ -76,6 +83,8 @@ def plan_capture(capture: Capture, wavelength: float | None = None) -> Plan:
     Args:
         capture: as read.
         wavelength: of the image, m; None takes four spot spacings, as the model does.
+        sum_bins: taken as it is, where it is given.
+        gate: the same, after summing.
 
     Returns:
         The plan.
@@ -90,21 +99,23 @@ def plan_capture(capture: Capture, wavelength: float | None = None) -> Plan:
         >>> counts[:, 1000:1030] = 50
         >>> plan = plan_capture(Capture(counts, spots, spots, up, up, bin_length=0.0012))
         >>> plan.sum_bins, plan.gate, plan.depth
-        (8, (0, 150), (0.5567, 0.6625))
+        (8, (0, 150), (0.5576, 0.6616))
     """
     length = 4 * spot_spacing(capture) if wavelength is None else wavelength
-    gated = behind_pulse(capture)
-    most = (gated.gate[1] - gated.gate[0]) // SAMPLES
-    factor = max(1, min(math.floor(length / SAMPLES / capture.bin_length + 1e-6), most))
-    came = returns(gated)
+    if sum_bins is None:
+        most = (capture.gate[1] - capture.gate[0]) // SAMPLES
+        sum_bins = max(1, min(math.floor(length / SAMPLES / capture.bin_length + 1e-6), most))
+    summed = (capture if gate is not None else behind_pulse(capture)).sum_bins(sum_bins)
+    if gate is not None:
+        summed = summed.with_gate(*gate)
+    came = returns(summed)
     depth = None
     if len(came.first):
         near = float(np.percentile((came.first**2 - came.apart**2) / (2 * came.first), 1)) - length / 2
         far = float(np.median(np.sqrt(np.maximum(came.last**2 - came.apart**2, 0)))) / 2 + length / 2
         near = max(near, length / 2)
         depth = (float(f"{near:.4g}"), float(f"{max(far, near + length):.4g}"))
-    summed = gated.sum_bins(factor)
-    return Plan(length, factor, summed.gate, depth, summed.bin_length / 2)
+    return Plan(length, sum_bins, summed.gate, depth, summed.bin_length / 2)
 
 
 def behind_pulse(capture: Capture) -> Capture:
@@ -122,8 +133,8 @@ def returns(capture: Capture) -> Returns:
     """When light comes back, by each spot's gated transient, smoothed over 80 ps.
 
     The rise is the one that leads to the peak, so a direct pulse's tail at the gate's start does not count.
-    Spots whose peak does not stand six standard deviations above their own lowest tenth are left out, and so
-    is light that does not stand four above it.
+    Spots whose peak may be noise (:func:`light_of`) are left out, and so is light that does not stand
+    ``FAINT`` standard deviations above the floor.
     """
     found = np.array(list(_returns(capture)), dtype=np.float64).reshape(-1, 3)
     start = capture.path_gate[0]
@@ -142,10 +153,10 @@ def _returns(capture: Capture) -> Iterator[tuple[int, int, float]]:
         if len(bins) == 0:
             continue
         level = smooth(capture.counts[spot, first + bins], width)
-        above, noise = above_floor(level, width, capture.is_counts)
+        above, noise, is_light = light_of(level, width, capture.is_counts)
         peak = int(np.argmax(level))
         below = np.flatnonzero(above[:peak] < 0.2 * above[peak])
-        if above[peak] > PEAK * noise and len(below):
+        if is_light and len(below):
             at = int(below[-1]) + 1
             around = bins[max(at - width, 0) : at + width]
             if around[-1] - around[0] < len(around):
@@ -155,8 +166,8 @@ def _returns(capture: Capture) -> Iterator[tuple[int, int, float]]:
                 yield int(bins[at]), int(bins[end]), apart
 
 
-def above_floor(level: np.ndarray, width: int, is_counts: bool) -> tuple[np.ndarray, float]:
-    """A smoothed transient above its own lowest tenth.
+def light_of(level: np.ndarray, width: int, is_counts: bool) -> tuple[np.ndarray, float, bool]:
+    """What of a spot's smoothed transient is light that comes back.
 
     Args:
         level: ``[T]`` counts a bin, mean over ``width`` bins.
@@ -164,22 +175,12 @@ def above_floor(level: np.ndarray, width: int, is_counts: bool) -> tuple[np.ndar
         is_counts: whether they are photon counts, and scatter.
 
     Returns:
-        ``[T]`` what is above, and its standard deviation at the floor.
+        ``[T]`` what is above the lowest tenth; the standard deviation of its median; whether the peak is more
+        than Poisson counts around the median would reach anywhere in the gate, but for ``CHANCE``.
     """
-    floor = float(np.percentile(level, 10))
-    return level - floor, math.sqrt(max(floor, 1 / width) / width) if is_counts else 0.0
-
-
-def stands_out(level: np.ndarray, width: int, is_counts: bool) -> bool:
-    """Whether a smoothed transient has a peak that is no noise.
-
-    Args:
-        level: ``[T]`` counts a bin, mean over ``width`` bins.
-        width: bins that are smoothed over.
-        is_counts: whether they are photon counts, and scatter.
-
-    Returns:
-        It is ``PEAK`` standard deviations above the floor.
-    """
-    above, noise = above_floor(level, width, is_counts)
-    return bool(above.max() > PEAK * noise)
+    above = level - float(np.percentile(level, 10))
+    if not is_counts:
+        return above, 0.0, bool(above.max() > 0)
+    usual = max(float(np.median(level)) * width, 1.0)
+    chance = len(level) * stats.poisson.sf(round(float(level.max()) * width) - 1, usual)
+    return above, math.sqrt(usual) / width, bool(chance < CHANCE)

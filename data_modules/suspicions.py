@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 from scipy.spatial import cKDTree
 
-from data_modules.plan import stands_out
+from data_modules.plan import light_of
 from data_modules.readers.assemble import counted, direct_pulse, smooth
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import find_lattice, scan_geometry
@@ -461,7 +461,7 @@ def time_order(capture: Capture) -> list[str]:
 
     A pulse, its tail, and the falloff with distance all make transients rise faster than they fall. Compared
     are the counts within 1 ns (0.3 m of path, half of it to either side) of a spot's peak, where that stands
-    out (:func:`~data_modules.plan.stands_out`).
+    out (:func:`~data_modules.plan.light_of`).
     """
     first, last = capture.gate
     half = max(1, round(0.006 / capture.bin_length))
@@ -472,7 +472,7 @@ def time_order(capture: Capture) -> list[str]:
         level = smooth(counts, 2 * half + 1)
         peak = int(np.argmax(level))
         side = min(reach, peak, last - first - 1 - peak)
-        if side <= half or not stands_out(level, 2 * half + 1, capture.is_counts):
+        if side <= half or not light_of(level, 2 * half + 1, capture.is_counts)[2]:
             continue
         before = counts[peak - side : peak - half].sum()
         behind = counts[peak + half + 1 : peak + side + 1].sum()

@@ -41,6 +41,7 @@ COMMON: dict[str, Rule] = {
     "threads": optional(whole(1, 1024)),
     "data_dir": TEXT,
     "memory_budget": SIZE,
+    "force": FLAG,
 }
 SCAN: dict[str, Rule] = {
     "kind": word("confocal", "single", "exhaustive"),
@@ -89,9 +90,9 @@ SCENE: dict[str, Rule] = {
     "reader.counts": optional(FLAG),
     "reader.observed": optional(word("all")),
     "gate": optional(_pair),
-    "sum_bins": whole(1, 100_000, "bins"),
+    "sum_bins": optional(whole(1, 100_000, "bins")),
     "sum_spots": whole(1, 10_000, "spots"),
-    "volume.depth": many(_length, 2, ascending=True),
+    "volume.depth": optional(many(_length, 2, ascending=True)),
     "volume.depth_pitch": optional(number(1e-5, 10, "m")),
     "volume.upsample": whole(1, 64),
     "volume.lateral": optional(many(whole(1, 10_000, "voxels"), 2)),

@@ -284,7 +284,7 @@ BAD = {
     "scene=capture scene.path=/nowhere/x.mat": "must be a file or folder that is there",
     "scene.gate=[200,200]": "scene.gate must be",
     "scene.volume.depth=[5,6]": "lies outside the capture's time window",
-    "scene.volume.depth=[0.9,0.4]": "a < b; found",
+    "scene.volume.depth=[0.9,0.4]": "a < b, or null; found",
     "effects=[irf_tail,pileup]": "no effect 'pileup'; did you mean pile_up",
     "memory_budget=1MiB": "the budget is",
     "memory_budget=lots": "must be a size",
