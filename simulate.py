@@ -2,8 +2,10 @@
 
 Writes OUT, a y-tal HDF5 capture, and OUT's name with ``_truth.h5``: depth, normals and albedo as seen
 from the wall, and the mesh. A scene of one's own: ``'bodies=[{kind: cone, at: [0, 0, 0.6]}]'``; one drawn
-at random: ``random=7`` (docs/simulator.md). With physical effects: ``python simulate.py scene=letters
-effects=[pile_up] pile_up.detections=0.3 out=X.hdf5`` (docs/effects.md).
+at random: ``random=7`` (docs/simulator.md). With physical effects, each with strengths as
+EFFECT.PARAMETER=VALUE (docs/effects.md):
+
+    python simulate.py scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5
 """
 
 import logging

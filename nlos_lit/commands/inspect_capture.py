@@ -14,7 +14,7 @@ from nlos_lit.report.capture_figure import draw_capture
 
 def inspect_capture(arguments: list[str]) -> int:
     """Print what the file named by ``arguments`` holds, draw it, and return the exit status."""
-    given = _parser().parse_args(arguments).__dict__
+    given = parse(arguments).__dict__
     path, fmt, out = given.pop("file"), given.pop("format"), given.pop("out")
     size, gate = given.pop("wall_size"), given.pop("gate")
     try:
@@ -34,6 +34,11 @@ def inspect_capture(arguments: list[str]) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """What the command line says."""
+    return _parser().parse_args(arguments)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -141,8 +141,8 @@ def check_overrides(command: str, overrides: list[str]) -> None:
             override = OverridesParser.create().parse_override(text)
         except HydraException as error:
             raise UserError(
-                f"cannot read the argument {text!r}: write KEY=VALUE, and lists in quotes, 'KEY=[1,2]' "
-                f"({str(error).splitlines()[0]})"
+                f"cannot read the argument {text!r} ({str(error).splitlines()[0]}): write KEY=VALUE, lists "
+                "in quotes, 'KEY=[1,2]', and values with other characters in two sorts of them, \"KEY='a ü'\""
             ) from error
         keys.add(override.key_or_group)
         _check_override(command, override)

@@ -136,7 +136,7 @@ MISTAKES = [
     ("effects=3", "effects must be a list"),
     ("fit=points", "one of volume, surface"),
     ("refine=yes_please", "true or false"),
-    ("scene.volume.depth=[0.5,", "cannot read the argument .* lists in quotes"),
+    ("scene.volume.depth=[0.5,", "cannot read the argument .* lists in quotes, .* in two sorts"),
     ("scene.volume.depth=[0.5, 1", "cannot read the argument"),
     ("=3", "there is no key ; there are"),
     ("su", "cannot read the argument"),
