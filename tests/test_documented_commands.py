@@ -15,7 +15,7 @@ from nlos_lit.runtime.arguments import CONF, check_assignments, check_overrides,
 from nlos_lit.runtime.keys import KEYS
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
-PROGRAMS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture")
+PROGRAMS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
 START = rf"(?:\.venv/bin/)?python (?:{'|'.join(PROGRAMS)})\.py\b"
 
 
@@ -60,12 +60,16 @@ def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
             check_assignments(command, given)
         elif command == "results":
             results.parse(given)
-        else:
+        elif command == "inspect_capture":
             inspect_capture.parse(words)
+        else:
+            assert len(given) >= 2
 
 
 def test_commands_are_found():
-    page = "Say `python train.py scene=su`:\n\n    python simulate.py scene=letters \\\n        out=X.hdf5  # so\n"
+    page = (
+        "`python train.py scene=su`:\n\n    python simulate.py scene=letters \\\n        out=X.hdf5  # so\n"
+    )
     assert printed(page) == ["python simulate.py scene=letters out=X.hdf5  # so", "python train.py scene=su"]
     assert sum(len(printed(text)) for text in sources().values()) > 60
 
