@@ -15,7 +15,16 @@ from data_modules.readers.assemble import COMMON_OPTIONS, assemble, remove_delay
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.frame import device_distances, wall_rotation
 from data_modules.readers.options import ReaderOptions
-from data_modules.readers.ytal_write import OBSERVED, T_LI_SI, T_LX_LY_SX_SY, T_SI, T_SX_SY, layout, own_facts, whole
+from data_modules.readers.ytal_write import (
+    OBSERVED,
+    T_LI_SI,
+    T_LX_LY_SX_SY,
+    T_SI,
+    T_SX_SY,
+    layout,
+    own_facts,
+    whole,
+)
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 

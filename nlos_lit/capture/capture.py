@@ -69,7 +69,8 @@ class Capture:
 
     Raises:
         CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, the exposure
-            is no time, the gate is empty or none of its bins was recorded, or counts lie in bins that were not recorded.
+            is no time, the gate is empty or none of its bins was recorded, or counts lie in bins that were
+            not recorded.
 
     Examples:
         A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:

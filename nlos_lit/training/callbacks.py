@@ -37,6 +37,15 @@ class ScoreHeldout(L.Callback):
         if not module.scores:
             module.scores = {"initial": module.all_scores(_data(trainer))}
 
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """There is something to fit: earlier final scores are none any more.
+
+        Args:
+            trainer: not looked at.
+            module: loses ``scores["final"]``.
+        """
+        cast(CaptureFit, module).scores.pop("final", None)
+
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Score what was fitted.
 
@@ -46,6 +55,16 @@ class ScoreHeldout(L.Callback):
         """
         module = cast(CaptureFit, module)
         module.scores["final"] = module.all_scores(_data(trainer))
+
+    def on_fit_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Score what was fitted where nothing was left to fit: the run was stopped after its last iteration.
+
+        Args:
+            trainer: its data module holds the spots.
+            module: as in :meth:`on_train_end`.
+        """
+        if "final" not in cast(CaptureFit, module).scores:
+            self.on_train_end(trainer, module)
 
 
 class History(L.Callback):

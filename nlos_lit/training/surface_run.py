@@ -74,7 +74,9 @@ def prepare_surface(run: Run, laser_sensor: LaserSensor | None = None) -> Surfac
     log.info("%d surfels at the maxima of the image; %d batches and more", len(fit.model), fit.ahead)
     grid = phasor.grid
     image = FrontImage(intensity.amax(0).numpy(), grid.x, grid.y)
-    return SurfaceFitting(fit, normalisation(run.capture), image)
+    module = SurfaceFitting(fit, normalisation(run.capture), image)
+    module.origin = run.origin
+    return module
 
 
 def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -> dict[str, Any]:
