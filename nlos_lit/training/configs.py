@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -30,12 +31,14 @@ SETTINGS: dict[str, type] = {
     "surfels": SurfelSettings,
     "criticism": CriticismSettings,
 }
+LONGEST_NAME = 64  # characters of a capture's name
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
 T = TypeVar("T")
 
 
 def register_settings() -> None:
-    """Make the groups ``schema/…`` known to Hydra; to be called before a config is composed."""
+    """Make the groups ``schema/…`` and ``${file_name:…}`` known; to be called before a config is composed."""
+    OmegaConf.register_new_resolver("file_name", file_name, replace=True)
     store = ConfigStore.instance()
     for name, kind in SETTINGS.items():
         node = OmegaConf.structured(kind)
@@ -44,6 +47,17 @@ def register_settings() -> None:
     parameters = inspect.signature(L.Trainer.__init__).parameters.values()
     trainer = {p.name: p.default for p in parameters if p.name not in GIVEN}
     store.store(group="schema", name="trainer", node=trainer)
+
+
+def file_name(path: str | None) -> str:
+    """What a capture is called after its file, in titles and as a folder.
+
+    Examples:
+        >>> file_name("data/our lab, 3 May.hdf5"), file_name("cat.v2.mat"), file_name(None)
+        ('our_lab_3_May', 'cat.v2', 'capture')
+    """
+    words = re.findall(r"[\w.-]+", "" if path is None else Path(path).stem)
+    return "_".join(words).strip("._-")[:LONGEST_NAME] or "capture"
 
 
 def compose(command: str, overrides: Iterable[str] = ()) -> dict[str, Any]:
