@@ -6,14 +6,13 @@ What y-tal has no place for goes into ``scene_info``.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from data_modules.whole_hdf5 import whole_hdf5
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
@@ -199,20 +198,8 @@ def _is_product(capture: Capture, lasers: np.ndarray, sensors: np.ndarray) -> bo
 
 
 def _write(path: Path, items: dict[str, Any]) -> None:
-    try:
-        handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise CaptureError(f"cannot write {path}: {error.strerror or error}") from error
-    os.close(handle)
-    try:
-        with h5py.File(partial, "w") as file:
-            for name, value in items.items():
-                packed = name in ("H", OBSERVED)
-                options = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if packed else {}
-                file.create_dataset(name, data=value, **options)
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    except OSError as error:
-        raise CaptureError(f"cannot write {path}: {error}") from error
-    finally:
-        Path(partial).unlink(missing_ok=True)
+    with whole_hdf5(path) as file:
+        for name, value in items.items():
+            packed = name in ("H", OBSERVED)
+            options = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if packed else {}
+            file.create_dataset(name, data=value, **options)

@@ -18,7 +18,7 @@ from nlos_lit.metrics.geometry import geometry_errors
 from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors
-from nlos_lit.runtime.memory import check_machine, parse_bytes, peak_bytes
+from nlos_lit.runtime.memory import check_disk, check_machine, parse_bytes, peak_bytes
 from nlos_lit.training.folder import resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.summary import git_state, versions
 
@@ -48,6 +48,7 @@ def reconstruct(config: DictConfig) -> None:
     grid = volume_grid(capture, **scene["volume"])
     needed = estimate_bytes(capture, grid, method["name"])
     check_machine(needed, f"method={method['name']}")
+    check_disk(folder, 4 * grid.n_voxels, "volume.h5")
     log.info(
         "%s: volume %d x %d x %d voxels, about %.2f GiB",
         method["name"],

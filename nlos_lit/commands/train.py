@@ -19,6 +19,7 @@ from omegaconf import DictConfig
 from nlos_lit.capture.errors import UserError
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.runtime.command_line import output_folder, quiet_libraries, quote_numbers, sentence_errors
+from nlos_lit.runtime.memory import check_disk
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import register_settings, run_config
 from nlos_lit.training.folder import (
@@ -33,7 +34,14 @@ from nlos_lit.training.folder import (
 from nlos_lit.training.instantiate import build_all, builder
 from nlos_lit.training.origin import IMAGE, START, SURFACE, check_origin, finished_checkpoint
 from nlos_lit.training.outcome import write_results, write_surface_summary
-from nlos_lit.training.run_folder import Run, field_shards, find_checkpoint, load_fitted, prepare_run
+from nlos_lit.training.run_folder import (
+    Run,
+    field_shards,
+    find_checkpoint,
+    load_fitted,
+    prepare_run,
+    run_disk_bytes,
+)
 from nlos_lit.training.surface_fitting import SurfaceFitting
 from nlos_lit.training.surface_run import prepare_surface, write_surface
 
@@ -101,6 +109,7 @@ def _self_calibration(
     callback_of(trainer, ScoreHeldout)
     run = prepare_run(settings, device_of(settings), field_shards(settings), opened(checkpoint, IMAGE))
     if trainer.is_global_zero:
+        check_disk(folder, run_disk_bytes(run.module.pipeline.phasor.grid.n_voxels), "this run")
         begin_training(settings, folder, checkpoint)
     fit_or_leave(trainer, run.module, run, checkpoint)
     if trainer.checkpoint_callbacks:  # also where the last iteration is none of every n-th

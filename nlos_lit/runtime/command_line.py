@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import logging
 import re
@@ -9,17 +10,28 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 
 from nlos_lit.capture.errors import UserError
 
+_FULL = "make room, or write elsewhere"
+_CLOSED = "change who may write there, or give another place"
+_NAMED = "move away what is there, or give another place"
+# What the disk may answer, and what to do.
+REFUSED = MappingProxyType(
+    {errno.ENOSPC: _FULL, errno.EDQUOT: _FULL, errno.EFBIG: _FULL}
+    | {errno.EROFS: _CLOSED, errno.EACCES: _CLOSED, errno.EPERM: _CLOSED}
+    | {errno.ENOTDIR: _NAMED, errno.EISDIR: _NAMED, errno.EEXIST: _NAMED, errno.ENAMETOOLONG: _NAMED}
+)
+
 
 def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
     """Print a :class:`~nlos_lit.capture.errors.UserError` as one sentence and exit with status 2.
 
-    Ctrl-C is one word and status 130. Anything else keeps its traceback.
+    So is what the disk refuses. Ctrl-C is one word and status 130. Anything else keeps its traceback.
     """
 
     @functools.wraps(task)
@@ -28,6 +40,13 @@ def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
             return task(*args, **kwargs)
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
+            sys.exit(2)
+        except OSError as error:
+            advice = REFUSED.get(error.errno or 0)
+            if advice is None:
+                raise
+            where = error.filename or "a result"  # other libraries' writers do not say which
+            print(f"error: {where}: {error.strerror}; {advice}", file=sys.stderr)
             sys.exit(2)
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)

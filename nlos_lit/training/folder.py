@@ -19,6 +19,7 @@ from nlos_lit.io.files import whole_file, write_json
 from nlos_lit.runtime.claim import claim
 from nlos_lit.runtime.command_line import given_values
 
+OUTPUTS = "outputs"  # where results go that no other folder is given for
 OVERRIDES = "overrides.json"  # the settings that a training was begun with
 # What a folder holds, by the first of these that is in it.
 HOLDS = MappingProxyType(
@@ -62,10 +63,14 @@ def take_given_folder(arguments: list[str]) -> None:
     """:func:`take_folder` before Hydra writes anything, where the command line says ``hydra.run.dir``.
 
     Raises:
-        UserError: as there.
+        UserError: as there, or nothing can be written where the run's folder is to be.
     """
     given = given_values(arguments)
-    folder = Path(given.get("hydra.run.dir", ""))
+    folder = Path(given.get("hydra.run.dir", OUTPUTS))
+    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        found = "cannot be written to" if there.is_dir() else "is no folder"
+        raise UserError(f"{there} {found}; give another folder for the results: hydra.run.dir=FOLDER")
     if "hydra.run.dir" in given and folder.is_dir():
         take_folder(folder, goes_on_in(folder, given.get("ckpt_path")))
 

@@ -237,6 +237,7 @@ def find_checkpoint(
     return others[-1]
 
 
+_PICTURES = 20 * 2**20  # figures as files and in TensorBoard, points, mesh
 _SCRATCH = 100 * 2**20  # runs of samples that are worked on at once
 
 
@@ -258,3 +259,17 @@ def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     iterating = 72 * n_voxels + 120 * rays
     matching = 24 * n_voxels + 180 * rays
     return max(plan.total_bytes, plan.resident_bytes + max(iterating, matching) + _SCRATCH)
+
+
+def run_disk_bytes(n_voxels: int) -> int:
+    """What a run writes: three checkpoints (one while it replaces another), volume and albedo, pictures.
+
+    A checkpoint holds three numbers a voxel: its albedo and Adam's two moments.
+
+    Args:
+        n_voxels: of the volume.
+
+    Returns:
+        Bytes.
+    """
+    return (3 * 12 + 8) * n_voxels + _PICTURES

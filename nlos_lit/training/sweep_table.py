@@ -10,6 +10,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table, write_csv
 
 log = logging.getLogger(__name__)
@@ -66,4 +67,5 @@ def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
     def cell(value: Any) -> str:
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
-    (folder / "table.md").write_text(markdown_table(rows, cell) + "\n")
+    with whole_file(folder / "table.md") as partial:
+        partial.write_text(markdown_table(rows, cell) + "\n", encoding="utf-8")
