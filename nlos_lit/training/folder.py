@@ -102,7 +102,7 @@ def resume_run(arguments: list[str]) -> None:
     if "resume" not in given:
         return
     folder = Path(given["resume"])
-    if not (folder / OVERRIDES).exists():
+    if not (folder / OVERRIDES).is_file():
         raise UserError(f"{folder} is not the folder of a run that has begun: {OVERRIDES} is missing")
     now = [item for item in arguments[1:] if not item.startswith("resume=")]
     now += ["ckpt_path=last", f"hydra.run.dir='{folder}'"]

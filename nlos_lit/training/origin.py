@@ -92,7 +92,7 @@ def finished_checkpoint(folder: Path) -> Path:
         UserError: the folder holds none, or one that stopped before its end.
     """
     file = folder / "checkpoints" / "last.ckpt"
-    if not file.exists():
+    if not file.is_file():
         raise UserError(
             f"{folder} is not the folder of a finished self-calibration: checkpoints/last.ckpt is missing"
         )

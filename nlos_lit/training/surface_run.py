@@ -196,7 +196,7 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
     """
     place = Path(folder) / "refined"
     for name in ("surfels.pt", "effects.pt"):
-        if not (place / name).exists():
+        if not (place / name).is_file():
             raise UserError(
                 f"{folder} holds no refined surfels: refined/{name} is missing; "
                 "run train.py with refine=true, effects=[…] or model=surface"
