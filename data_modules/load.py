@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pooch
+import yaml
 
 from data_modules.plan import plan_capture
 from data_modules.readers import ReaderOptions, read_capture
@@ -18,6 +20,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 
 log = logging.getLogger(__name__)
+SCENE_CONFIGS = Path(__file__).resolve().parents[1] / "conf" / "scene"
 
 
 def load_scene(
@@ -92,6 +95,8 @@ def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
     """The scene's file, downloaded where it is missing and a URL and a checksum are known.
 
+    Only sources of conf/scene are downloaded: a run's folder, whose config says the scene, can be foreign.
+
     Args:
         scene: a config of conf/scene.
         data_dir: where it is looked for; ``scene.path`` comes first.
@@ -117,6 +122,11 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
     if path.exists():
         return path
     if source["url"] is not None and source["sha256"] is not None:
+        if dict(source) not in shipped_sources():
+            raise UserError(
+                f"{source['url']} is no address of this project's own scenes; nothing is downloaded from it: "
+                f"fetch it by hand, put it at {path}, or give scene.path=FILE"
+            )
         log.info("downloading %s from %s", source["file"], source["url"])
         try:
             fetched = pooch.retrieve(
@@ -133,6 +143,13 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
         f"It comes from {source['origin']}. Download it there and put it at {path}, "
         "or give its place as scene.path=FILE"
     )
+
+
+@functools.cache
+def shipped_sources() -> list[dict[str, Any]]:
+    """Where the data of this project's own scenes come from."""
+    configs = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in SCENE_CONFIGS.glob("*.yaml"))
+    return [config["source"] for config in configs if config.get("source")]
 
 
 def _options(reader: Mapping[str, Any]) -> ReaderOptions:

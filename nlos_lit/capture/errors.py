@@ -6,11 +6,24 @@ import difflib
 from collections.abc import Iterable
 
 
+def printable(text: str) -> str:
+    """Text with its control characters spelt out: what a file says of itself must not steer a terminal.
+
+    Examples:
+        >>> printable("Höhe" + chr(27) + "[2J" + chr(10) + "m")
+        'Höhe\\\\x1b[2J\\nm'
+    """
+    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
+
+
 class UserError(Exception):
     """Something the user gave cannot work; the message says what was found, what was expected and what to do.
 
     The commands print the message alone, without a traceback, and exit with status 2.
     """
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class CaptureError(UserError, ValueError):

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from data_modules.examine import describe, examine
 from data_modules.readers import READERS, ReaderOptions, detect_format, read_capture
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import UserError, printable
 from nlos_lit.report.capture_figure import draw_capture
 
 
@@ -22,7 +22,7 @@ def inspect_capture(arguments: list[str]) -> int:
         options = ReaderOptions(wall_size=wall_size, gate=tuple(gate) if gate else None, **given)
         capture = read_capture(path, fmt, options=options)
         findings = examine(capture)
-        print(describe(capture, detect_format(path) if fmt == "auto" else fmt, findings))
+        print(printable(describe(capture, detect_format(path) if fmt == "auto" else fmt, findings)))
         picture = out / f"{path.stem}_capture.png"
         try:
             out.mkdir(parents=True, exist_ok=True)

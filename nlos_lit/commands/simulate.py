@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -30,6 +31,7 @@ from data_modules.simulate import (
 )
 from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime.arguments import check_assignments
+from nlos_lit.runtime.memory import check_disk
 from nlos_lit.surfels.measure import measure
 
 SCENE_HELP = (
@@ -192,6 +194,7 @@ def simulate(arguments: list[str]) -> None:
     for file in (out, truth_file):
         if file.exists() and not options.overwrite:
             raise UserError(f"{file} is already there; take another name or say overwrite=true")
+    check_disk(out.parent, math.prod(scan.scan_shape) * scan.n_bins, str(out))  # packed, about a byte a bin
     mesh, bodies = build(options)
     if options.random is not None:
         print(one_line(bodies))

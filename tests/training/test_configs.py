@@ -27,7 +27,7 @@ from nlos_lit.model.objective import Objective
 from nlos_lit.runtime.arguments import check_config
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
+from nlos_lit.training.configs import CONF, SETTINGS, compose, file_name, run_config, settings_of
 
 
 def names(group: str) -> list[str]:
@@ -345,6 +345,18 @@ def test_a_folder_of_another_version_is_one_sentence(tmp_path):
     unread = r"no objective, model.clip, model.rates, scene.volume.refine"
     with pytest.raises(UserError, match=rf"another version .* \(it has {unread}\)"):
         run_config(tmp_path)
+
+
+@pytest.mark.parametrize("path", ["data/mine.hdf5", "../mine.mat", "'my=/mine'"])
+def test_a_capture_of_your_own_is_called_after_its_file(path):
+    config = composed("scene=capture", f"scene.path={path}")
+    assert (config["scene"]["name"], config["scene"]["path"]) == ("mine", path.strip("'"))
+
+
+def test_no_file_name_leaves_the_outputs():
+    assert [file_name(name) for name in ("..", "a/..", "/", "", "~/.ssh/", "x" * 5000, "e/é ü\n*.mat")] == [
+        "capture", "capture", "capture", "capture", "ssh", "x" * 64, "é_ü",
+    ]  # fmt: skip
 
 
 def test_another_optimiser_is_a_word():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,12 @@ def train(*overrides: str, folder: Path | None = None, check: bool = True) -> su
     if check:
         assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     return done
+
+
+def run_line(arguments: list[str]) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 def state(folder: Path) -> dict:
@@ -169,7 +176,10 @@ def test_a_finished_folder_is_not_overwritten(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
     done = train("scene.iterations=1", folder=finished, check=False)
     assert done.returncode == 2
-    assert "already holds a finished run" in done.stderr
+    assert (
+        "already holds a finished run; choose another hydra.run.dir, or go on with it: "
+        f"python train.py resume={finished}"
+    ) in done.stderr
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
 
 
@@ -196,11 +206,17 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     )  # fmt: skip
     output = done.stdout + done.stderr
     assert done.returncode == 130, output
-    assert "interrupted; go on with: python train.py " in output
-    assert f"scene.iterations=6 logger=none ckpt_path=last hydra.run.dir={folder}\n" in output
+    line = shlex.split(output.split("interrupted; go on with: ")[1].splitlines()[0])
+    assert line == ["python", "train.py", f"resume={folder}"]
     assert not (folder / "summary.json").exists()
     assert state(folder)["epoch"] == 2  # though spots were scored after 1 and 3
-    train("scene.iterations=6", "logger=none", "ckpt_path=last", folder=folder)
+    kept = {name: (folder / name).read_bytes() for name in ("config.yaml", "overrides.json")}
+    done = run_line([*line[1:], "seed=3"])
+    assert done.returncode == 2
+    assert "was made with seed=0, this command has 3" in done.stderr.strip().splitlines()[-1]
+    assert all((folder / name).read_bytes() == content for name, content in kept.items())
+    done = run_line(line[1:])
+    assert done.returncode == 0, done.stderr
     resumed, straight = state(folder)["state_dict"], state(finished)["state_dict"]
     assert resumed.keys() == straight.keys()
     for name in straight:
