@@ -82,11 +82,8 @@ def begun(command: str, config: DictConfig) -> Iterator[None]:
 def _without_results(folder: Path) -> bool:
     """Whether a folder holds nothing but how a command was begun."""
     kept = {".hydra", ".lock"}
-    files = {".log", ".yaml", ".json"}
-    return folder.is_dir() and all(
-        path.name in kept or (path.suffix in files and path.name != "summary.json")
-        for path in folder.iterdir()
-    )
+    files = {".log", ".yaml"}
+    return folder.is_dir() and all(path.name in kept or path.suffix in files for path in folder.iterdir())
 
 
 def check_assignments(command: str, arguments: list[str]) -> None:

@@ -15,6 +15,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table, write_csv
 
 log = logging.getLogger(__name__)
@@ -141,7 +142,8 @@ def write_table(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     spread = over_seeds(rows)
     if spread:
         write_csv(folder / "seeds.csv", spread)
-    (folder / "table.md").write_text(table(rows) + "\n")
+    with whole_file(folder / "table.md") as partial:
+        partial.write_text(table(rows) + "\n", encoding="utf-8")
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
