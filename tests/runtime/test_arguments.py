@@ -62,8 +62,8 @@ MISTAKES = [
     ("trainer.precison=16", f"no key trainer.precison; {NEAR} precision"),
     ("modell.rays=20", f"no key modell.rays; {NEAR} model.rays"),
     (
-        "+hello=1",
-        r"there is no key hello; there are seed, threads, data_dir, memory_budget, force, scene, model",
+        "+zzzz=1",
+        r"there is no key zzzz; there are seed, threads, data_dir, memory_budget, force, scene, model",
     ),
     ("~scene.iteration", f"no key scene.iteration; {NEAR} iterations"),
     ("scene.iterations=-5", "scene.iterations must be a whole number from 1 to 10000000; found -5"),
