@@ -34,15 +34,16 @@ class MemoryBudgetError(UserError, MemoryError):
     """A computation needs more memory than the budget allows."""
 
 
-def suggest(name: str, known: Iterable[str]) -> str:
+def suggest(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
     """What to write instead of a name that does not exist, as the end of a sentence.
 
     Args:
         name: as it was given.
         known: the names there are.
+        listed: what is told where none of them is near; None for all of them.
 
     Returns:
-        The nearest of them, or all where none is near.
+        The nearest, or those listed.
 
     Examples:
         >>> suggest("itrations", ["threshold", "iterations"])
@@ -52,4 +53,6 @@ def suggest(name: str, known: Iterable[str]) -> str:
     """
     names = list(known)
     close = difflib.get_close_matches(name, names, n=3)
-    return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(names)}"
+    if close:
+        return f"did you mean {' or '.join(close)}?"
+    return f"there are {', '.join(names if listed is None else listed)}"

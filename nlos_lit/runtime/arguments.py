@@ -184,7 +184,9 @@ def _instead(key: str, known: Iterable[str]) -> str:
     section, _, name = key.rpartition(".")
     start = f"{section}." if section else ""
     beside = dict.fromkeys(other[len(start) :].split(".")[0] for other in known if other.startswith(start))
-    return suggest(name, beside) if section and beside else suggest(key, [*known, *beside])
+    if section and beside:
+        return suggest(name, beside)
+    return suggest(key, [*known, *beside], dict.fromkeys(other.split(".")[0] for other in known))
 
 
 def _values(override: Override) -> Iterator[Any]:

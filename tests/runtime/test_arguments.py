@@ -61,7 +61,10 @@ MISTAKES = [
     ("scenes.iterations=5", f"no key scenes.iterations; {NEAR} scene.iterations"),
     ("trainer.precison=16", f"no key trainer.precison; {NEAR} precision"),
     ("modell.rays=20", f"no key modell.rays; {NEAR} model.rays"),
-    ("+hello=1", "there is no key hello; "),
+    (
+        "+zzzz=1",
+        r"there is no key zzzz; there are seed, threads, data_dir, memory_budget, force, scene, model",
+    ),
     ("~scene.iteration", f"no key scene.iteration; {NEAR} iterations"),
     ("scene.iterations=-5", "scene.iterations must be a whole number from 1 to 10000000; found -5"),
     ("scene.iterations=0", "found 0"),
