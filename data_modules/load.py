@@ -20,6 +20,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 
 log = logging.getLogger(__name__)
+SMALLEST, LARGEST = 1e-15, 1e12  # of a capture's largest value; squares of it stand in single precision
 SCENE_CONFIGS = Path(__file__).resolve().parents[1] / "conf" / "scene"
 
 
@@ -37,7 +38,8 @@ def load_scene(
         Counts summed and gated as the scene says; the surface as seen from the wall, or None.
 
     Raises:
-        UserError: the data are not there (says where they come from and where to put them) or not usable.
+        UserError: the data are not there (says where they come from and where to put them) or not usable, or
+            their largest value is no count and no intensity.
     """
     if scene["simulate"] is not None and scene["path"] is None:
         capture, truth = _simulate(scene["simulate"], seed)
@@ -50,6 +52,12 @@ def load_scene(
     capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
     if scene["gate"] is not None:
         capture = capture.with_gate(*scene["gate"])
+    largest = float(capture.counts.max())
+    if not SMALLEST < largest < LARGEST:
+        raise UserError(
+            f"the capture's largest value is {largest:.3g}; what is computed of values beyond {SMALLEST:g} "
+            f"to {LARGEST:g} is lost in rounding: look for a damaged value, or give values in another unit"
+        )
     return capture, truth
 
 

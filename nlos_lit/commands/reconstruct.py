@@ -19,7 +19,7 @@ from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors
 from nlos_lit.runtime.memory import check_disk, check_machine, parse_bytes, peak_bytes
-from nlos_lit.training.folder import resolved, take_folder, take_given_folder, write_config
+from nlos_lit.training.folder import register_names, resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.summary import git_state, versions
 
 log = logging.getLogger(__name__)
@@ -30,6 +30,7 @@ def prepare(arguments: list[str]) -> None:
     """What must be done before Hydra reads the command line ``arguments``, in place."""
     quote_numbers(arguments)
     take_given_folder(arguments[1:])
+    register_names()
 
 
 def reconstruct(config: DictConfig) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import sys
 import time
@@ -270,9 +271,10 @@ def callback_of(trainer: L.Trainer, kind: type[C]) -> C:
 
 def _tell(summary: Mapping[str, Any], folder: Path) -> None:
     nmse, loss, refined = summary["heldout"]["nmse"], summary["loss"], summary["refined"]
+    noise = f" (noise {nmse['noise_floor']:.4f})" if math.isfinite(nmse["noise_floor"]) else ""
     log.info(
-        "held-out NMSE %.4f -> %.4f (noise %.4f), loss %.3e -> %.3e; results in %s",
-        nmse["initial"], nmse["final"], nmse["noise_floor"], loss["initial"], loss["final"], folder,
+        "held-out NMSE %.4f -> %.4f%s, loss %.3e -> %.3e; results in %s",
+        nmse["initial"], nmse["final"], noise, loss["initial"], loss["final"], folder,
     )  # fmt: skip
     if refined is not None:
         log.info("refined by %d surfels: held-out NMSE %.4f", refined["surfels"], refined["heldout"]["nmse"])

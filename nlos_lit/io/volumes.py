@@ -28,6 +28,7 @@ def write_volume(
 
     Raises:
         ValueError: ``values`` or an extra volume is not of the grid's shape.
+        UserError: one of them holds NaN or infinite values; nothing is written.
 
     Examples:
         >>> import tempfile
@@ -42,6 +43,12 @@ def write_volume(
     for name, array in volumes.items():
         if np.shape(array) != tuple(grid.shape):
             raise ValueError(f"{name} has shape {np.shape(array)}, its grid {tuple(grid.shape)}")
+        wrong = np.size(array) - np.count_nonzero(np.isfinite(array))
+        if wrong:
+            raise UserError(
+                f"{wrong} of {np.size(array)} voxels of the {name} are NaN or infinite, which is no result: "
+                "look for damaged values in the capture, or change the settings that led there"
+            )
     content = io.BytesIO()  # HDF5 does not survive a disk that becomes full under its hands
     with h5py.File(content, "w") as file:
         file.attrs["frame"] = (

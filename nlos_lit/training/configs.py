@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -25,6 +24,7 @@ from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
+from nlos_lit.training.folder import register_names
 from nlos_lit.training.instantiate import arguments_of
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -35,14 +35,13 @@ SETTINGS: dict[str, type] = {
 }
 LARGEST_CONFIG = 2**19  # bytes of a run's config.yaml
 DEEPEST_CONFIG = 32  # lists and mappings in each other
-LONGEST_NAME = 64  # characters of a capture's name
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
 T = TypeVar("T")
 
 
 def register_settings() -> None:
     """Make the groups ``schema/…`` and ``${file_name:…}`` known; to be called before a config is composed."""
-    OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+    register_names()
     store = ConfigStore.instance()
     for name, kind in SETTINGS.items():
         node = OmegaConf.structured(kind)
@@ -51,17 +50,6 @@ def register_settings() -> None:
     parameters = inspect.signature(L.Trainer.__init__).parameters.values()
     trainer = {p.name: p.default for p in parameters if p.name not in GIVEN}
     store.store(group="schema", name="trainer", node=trainer)
-
-
-def file_name(path: str | None) -> str:
-    """What a capture is called after its file, in titles and as a folder.
-
-    Examples:
-        >>> file_name("data/our lab, 3 May.hdf5"), file_name("cat.v2.mat"), file_name(None)
-        ('our_lab_3_May', 'cat.v2', 'capture')
-    """
-    words = re.findall(r"[\w.-]+", "" if path is None else Path(path).stem)
-    return "_".join(words).strip("._-")[:LONGEST_NAME] or "capture"
 
 
 def compose(command: str, overrides: Iterable[str] = ()) -> dict[str, Any]:

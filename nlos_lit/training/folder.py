@@ -29,10 +29,27 @@ HOLDS = MappingProxyType(
         OVERRIDES: "an interrupted run",
     }
 )
+LONGEST_NAME = 64  # characters of a capture's name
 # Processes that help another with its run have a number above 0 in one of these.
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 # Of a list of settings: neither an option of the command nor one of Hydra's own.
 SETTING = re.compile(r"(\+\+|\+|~)?(?!hydra\b)\w[\w./@-]*(=.*)?\Z", re.DOTALL)
+
+
+def register_names() -> None:
+    """Make ``${file_name:…}`` known to configs; to be called before one is composed."""
+    OmegaConf.register_new_resolver("file_name", file_name, replace=True)
+
+
+def file_name(path: str | None) -> str:
+    """What a capture is called after its file, in titles and as a folder.
+
+    Examples:
+        >>> file_name("data/our lab, 3 May.hdf5"), file_name("cat.v2.mat"), file_name(None)
+        ('our_lab_3_May', 'cat.v2', 'capture')
+    """
+    words = re.findall(r"[\w.-]+", "" if path is None else Path(path).stem)
+    return "_".join(words).strip("._-")[:LONGEST_NAME] or "capture"
 
 
 def take_folder(folder: Path, goes_on: bool = False) -> None:

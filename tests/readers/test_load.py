@@ -9,10 +9,12 @@ import threading
 import numpy as np
 import pytest
 from conftest import real_file
+from small_capture import fields
 
 from data_modules import load
 from data_modules.load import find_file, load_scene
 from data_modules.readers import write_capture
+from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.training.configs import compose
@@ -61,6 +63,15 @@ def test_a_file_in_the_data_folder_is_found(tmp_path):
         UserError, match=r"needs data_diffuse_s.mat.*comes from the supplement of O'Toole.*scene.path=FILE"
     ):
         find_file(scene("diffuse_s"), tmp_path)
+
+
+@pytest.mark.parametrize("largest", [1e38, 2e12, 1e-40])
+def test_values_that_no_sum_of_squares_holds_are_refused(tmp_path, largest):
+    counts = np.full((12, 10), 1e-3 * largest)
+    counts[0, 0] = largest
+    write_capture(tmp_path / "a.hdf5", Capture(**fields(counts=counts, is_counts=False)))
+    with pytest.raises(UserError, match=r"the capture's largest value is .*; what is computed of values"):
+        load_scene(scene("capture", f"scene.path={tmp_path}/a.hdf5"), tmp_path, seed=0)
 
 
 def test_a_foreign_config_downloads_nothing(tmp_path, monkeypatch):

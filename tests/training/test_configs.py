@@ -6,6 +6,8 @@ import dataclasses
 import functools
 import inspect
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,7 +29,8 @@ from nlos_lit.model.objective import Objective
 from nlos_lit.runtime.arguments import check_config
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.training.configs import CONF, SETTINGS, compose, file_name, run_config, settings_of
+from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
+from nlos_lit.training.folder import file_name
 
 
 def names(group: str) -> list[str]:
@@ -351,6 +354,14 @@ def test_a_folder_of_another_version_is_one_sentence(tmp_path):
 def test_a_capture_of_your_own_is_called_after_its_file(path):
     config = composed("scene=capture", f"scene.path={path}")
     assert (config["scene"]["name"], config["scene"]["path"]) == ("mine", path.strip("'"))
+
+
+def test_a_method_of_its_own_door_knows_that_name(tmp_path):
+    asked = ["scene=capture", "scene.path='our lab.mat'", "--cfg=job", "--resolve"]
+    done = subprocess.run(
+        [sys.executable, "reconstruct.py", *asked], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "name: our_lab\n" in done.stdout, done.stderr
 
 
 def test_no_file_name_leaves_the_outputs():
