@@ -28,6 +28,7 @@ from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 OF_HYDRA = ("hydra", "profile")
+RESUME = "resume"  # of train.py, and no key of its config: what was begun is read from that folder
 
 
 def look_over(command: str, arguments: list[str], about: str | None) -> None:
@@ -134,6 +135,8 @@ def check_overrides(command: str, overrides: list[str]) -> None:
     """
     keys = set()
     for text in overrides:
+        if command == "train" and text.startswith(f"{RESUME}="):
+            continue
         try:
             override = OverridesParser.create().parse_override(text)
         except HydraException as error:

@@ -357,7 +357,8 @@ def test_a_capture_of_your_own_is_called_after_its_file(path):
 
 
 def test_a_method_of_its_own_door_knows_that_name(tmp_path):
-    asked = ["scene=capture", "scene.path='our lab.mat'", "--cfg=job", "--resolve"]
+    (tmp_path / "our lab.mat").touch()
+    asked = ["scene=capture", f"scene.path='{tmp_path}/our lab.mat'", "--cfg=job", "--resolve"]
     done = subprocess.run(
         [sys.executable, "reconstruct.py", *asked], cwd=ROOT, capture_output=True, text=True, check=False
     )

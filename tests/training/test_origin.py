@@ -28,7 +28,7 @@ from nlos_lit.training.run_folder import find_checkpoint, open_run, prepare_run
 SMALL = [
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.03", "model.rays=20", "batch_spots=8",
     "heldout.block=3", "heldout.monitor_spots=8", "logger=none", "~callbacks.figures", "scene=capture",
-    "callbacks.checkpoint.every_n_epochs=1", "scene.iterations=2",
+    "scene.sum_bins=1",    "callbacks.checkpoint.every_n_epochs=1", "scene.iterations=2",
 ]  # fmt: skip
 
 
@@ -109,7 +109,17 @@ def test_the_file_counts_and_not_its_name(case, tmp_path):
 
 
 def test_every_setting_is_compared_or_makes_no_other_fit(case):
-    of_this_command = {"folder", "data_dir", "fit", "run", "refine", "ckpt_path", "threads", "memory_budget"}
+    of_this_command = {
+        "folder",
+        "data_dir",
+        "fit",
+        "run",
+        "refine",
+        "ckpt_path",
+        "threads",
+        "memory_budget",
+        "force",
+    }
     shown = {"shard_field", "export", "trainer", "callbacks", "logger", "experiment", "profile"}
     compared = {name.split(".")[0] for name in SURFACE} | {"scene"}
     assert set(case.config) <= compared | of_this_command | shown
