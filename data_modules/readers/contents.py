@@ -199,13 +199,15 @@ def open_contents(path: str | Path) -> Contents:
         CaptureError: nothing there, not readable, damaged, or of no known container.
     """
     path = Path(path)
-    if path.is_dir():
-        return open_folder(path)
-    if not path.exists():
-        raise CaptureError(f"there is no file {path}")
-    if not path.is_file():
-        raise CaptureError(f"{path} is a pipe or a device; a capture is a file, or a folder of .mat files")
     try:
+        if path.is_dir():
+            return open_folder(path)
+        if not path.exists():
+            raise CaptureError(f"there is no file {path}")
+        if not path.is_file():
+            raise CaptureError(
+                f"{path} is a pipe or a device; a capture is a file, or a folder of .mat files"
+            )
         with path.open("rb") as stream:
             head = stream.read(4096)
     except OSError as error:

@@ -154,8 +154,8 @@ def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
         wall = np.concatenate([capture.laser[:, 2], capture.sensor[:, 2]])
         raise CaptureError(
             f"the volume (z = {grid.z.min():.3g} to {grid.z.max():.3g} m) holds points of the wall, which "
-            f"lie at z = {wall.min():.3g} to {wall.max():.3g} m: begin deeper (scene.volume.depth), or turn the "
-            "positions so that the wall lies near z = 0"
+            f"lie at z = {wall.min():.3g} to {wall.max():.3g} m: begin deeper (scene.volume.depth), or turn "
+            "the positions so that the wall lies near z = 0"
         )
     if shortest >= last or longest <= first:
         raise CaptureError(

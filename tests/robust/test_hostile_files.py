@@ -63,6 +63,11 @@ def test_a_small_picture_of_many_pixels_is_refused(tmp_path, size):
         read_radiance(tmp_path / "a.hdr")
 
 
+def test_a_name_that_no_file_can_have_is_one_sentence():
+    with pytest.raises(CaptureError, match="x cannot be read: File name too long"):
+        read_capture("x" * 5000)
+
+
 def test_a_picture_full_of_holes_is_not_read(tmp_path):
     (tmp_path / "a.hdr").write_bytes(SIGNATURE)
     os.truncate(tmp_path / "a.hdr", 20 * 2**30)
