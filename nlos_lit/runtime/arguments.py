@@ -76,7 +76,7 @@ def begun(command: str, config: DictConfig) -> Iterator[None]:
         yield
     except UserError:
         if ours and _without_results(folder):
-            shutil.rmtree(folder)
+            shutil.rmtree(folder, ignore_errors=True)  # another process of the same run may be first
         raise
 
 
