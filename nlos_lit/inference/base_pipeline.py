@@ -87,7 +87,8 @@ class BasePipeline:
         again = fit.copy(copy.deepcopy(fit.extension), seed)
         again.settings = self.surfels
         left = max(1, self.surfels.rounds - COARSE)
-        again.schedule(rounds_of(self.surfels.steps, left, settle=False, grow_first=True), self.surfels.more)
+        plan = rounds_of(self.surfels.steps, left, settle=False, grow_first=True)
+        again.schedule(plan, self.surfels.more, lay=True)
         again.finish()
         return again
 

@@ -21,10 +21,11 @@ from nlos_lit.metrics.transients import transient_scores
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
-from nlos_lit.surfels.model import SurfelModel, points_along
+from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
 WORTH = 0.05  # nats a parameter that another round must gain
+PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "lays", "history", "losses")
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -109,6 +110,7 @@ class Round:
         parts: into which each side of a surfel is divided before it.
         trial: it is undone where it gains too little.
         grow: surfels die and grow before it.
+        anew: sheets are sampled once a cell before it.
         shapes: scanned parameters of effects start anew before it, where the counts ask for them.
     """
 
@@ -116,6 +118,7 @@ class Round:
     left: int = 0
     settling: bool = False
     grow: bool = False
+    anew: bool = False
     shapes: bool = False
     contest: bool = False
     parts: int = 1
@@ -263,9 +266,8 @@ class SurfelFit:
 
     def state(self) -> dict[str, Any]:
         """A copy of all that changes while the fit goes on, as tensors, numbers and plain containers."""
-        names = ("order", "place", "tested", "done", "more", "before", "undo", "history", "losses")
         return copy.deepcopy(
-            {name: getattr(self, name) for name in names}
+            {name: getattr(self, name) for name in PLAIN}
             | {
                 "model": dict(self.model.state_dict()),
                 "pairs": self.model.pairs,
@@ -293,7 +295,7 @@ class SurfelFit:
                 f"{sorted(own) or 'nothing'}; go on with the same effects, or begin anew"
             )
         device, state = self.counts.device, copy.deepcopy(state)
-        for name in ("order", "place", "tested", "done", "more", "before", "undo", "history", "losses"):
+        for name in PLAIN:
             setattr(self, name, state[name])
         self.model = SurfelModel.from_state(self.capture, state["model"])
         self.extension.load_state_dict(state["extension"])
@@ -347,7 +349,7 @@ class SurfelFit:
         )
         sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
 
-    def schedule(self, plan: Sequence[Round], more: int = 0) -> None:
+    def schedule(self, plan: Sequence[Round], more: int = 0, lay: bool = False) -> None:
         """Say what is to be done next; it takes the place of what was.
 
         Last rounds are added while the fit is above the noise and gains more than ``WORTH`` a parameter:
@@ -359,14 +361,22 @@ class SurfelFit:
         Args:
             plan: the rounds.
             more: last rounds that may be added, at most.
+            lay: the last round of all begins with sheets laid anew: surfels that were born one after another
+                lie unevenly, and imitate noise. It is the plan's own where none may be added, else one more.
         """
         self.plan, self.more, self.before = list(plan), more, math.inf
-        self.undo = None
+        self.undo, self.lays = None, lay and more > 0
+        if lay and not more:
+            self.plan[-1] = replace(self.plan[-1], anew=True)
         self._add_round()
 
     def _add_round(self) -> None:
-        if self.plan or not (self.more or self.undo):
-            return
+        if not self.plan and (self.more or self.undo):
+            self._go_finer()
+        if not self.plan and self.lays:
+            self.plan, self.lays = [Round(2 * self.settings.steps, grow=True, anew=True)], False
+
+    def _go_finer(self) -> None:
         deviance, noise = self._deviance()
         worth = 2 * WORTH / self.counts.numel()  # of a parameter, in deviance
         gains = self.before - deviance >= worth * self._n_parameters()
@@ -430,16 +440,34 @@ class SurfelFit:
         if now.grow:
             parts = (self.capture, self.grid, self.reserve, self.counts, self.train, self.tested)
             prune_and_grow(self.model, *parts, s.surfel_cost, self.extension, self.observed)
+        if now.anew:
+            self.model.lay_anew()
+            self.match_energy()
         if now.parts > 1:
             self.model.divide(now.parts)
         if s.visibility:
-            self.model.update_visibility()
+            self._hide()
         widest = float(self.model.cell.max())
         self.model.quadrature = (
             1 if now.contest else s.quadrature or points_along(widest, self.model.bin_length)
         )
         self.model.lay()
         self.optimizer = self._new_optimizer()
+
+    @torch.no_grad()
+    def _hide(self) -> None:
+        """Who hides whom, and from what albedo on: one of ``OPAQUE``, whichever makes the counts likeliest.
+
+        False surfels are faint, and must not hide what is true; dark surfaces are faint, and hide.
+        """
+        found = []
+        for opaque in OPAQUE:
+            self.model.opaque = opaque
+            self.model.update_visibility()
+            expected = self.model.expected(self.train[self.tested], self.extension).clamp_min(1e-9)
+            nats = (torch.xlogy(self.counts[self.tested], expected) - expected).double().sum()
+            found.append((float(nats), opaque, self.model.visible))
+        _, self.model.opaque, self.model.visible = max(found, key=lambda each: each[0])
 
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""

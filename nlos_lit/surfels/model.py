@@ -22,6 +22,7 @@ from nlos_lit.functional.surfel_graph import (
     neighbour_pairs,
     sheet_normals,
 )
+from nlos_lit.functional.surfel_lattice import lay_anew
 from nlos_lit.functional.surfel_paths import (
     SPLINE_VARIANCE,
     STEEP,
@@ -36,7 +37,7 @@ from nlos_lit.io.points import Points
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
-OPAQUE = 0.6  # of the mean albedo: fainter surfels may be false, and hide nothing
+OPAQUE = (0.6, 0.2, 0.05)  # of the mean albedo: surfels that are fainter than one of these hide nothing
 SIDE = 0.29  # cells: deviation of a place that is anywhere in a cell, 1/√12
 
 
@@ -72,6 +73,7 @@ class SurfelModel(nn.Module):
         direction: ``[M, 3]`` unit.
         axes: ``[M, 2, 3]`` m, a cell's sides in the surfel's own plane.
         visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
+        opaque: share of the mean albedo below which surfels hide nothing.
         observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
         pairs: neighbours on one sheet, see :meth:`link`.
         sheet: how normals follow from places, between :meth:`lay` and :meth:`lift`; None otherwise.
@@ -118,6 +120,7 @@ class SurfelModel(nn.Module):
         cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
         self.register_buffer("cell", cell, persistent=False)
         self.raw_passing = nn.Parameter(torch.tensor(-math.inf))
+        self.opaque = OPAQUE[0]
         self.place(centre, normal, albedo)
 
     def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
@@ -159,6 +162,12 @@ class SurfelModel(nn.Module):
         nx, ny = self.lateral.shape
         self.lateral, self.cell = Lateral((x, y), finer, (nx * parts, ny * parts)), self.cell / parts
         self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in (normal, self.albedo())))
+
+    @torch.no_grad()
+    def lay_anew(self) -> None:
+        """Sample each sheet once a cell, see :func:`~nlos_lit.functional.surfel_lattice.lay_anew`."""
+        origin = torch.tensor(self.lateral.origin, device=self.anchor.device)
+        self.place(*lay_anew(*self.placed(), self.albedo(), origin, self.cell))
 
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
@@ -241,7 +250,7 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def sees(self, spots: Tensor, places: Tensor) -> Tensor:
-        """Which places the surfels leave in view of laser and sensor; those below ``OPAQUE`` hide nothing.
+        """Which places the surfels leave in view of laser and sensor; those below ``opaque`` hide nothing.
 
         Args:
             spots: ``[B]`` rows of the capture.
@@ -251,7 +260,7 @@ class SurfelModel(nn.Module):
             ``[B, V]`` bool.
         """
         albedo, (centre, normal) = self.albedo(), self.placed()
-        solid = albedo > OPAQUE * albedo.mean()
+        solid = albedo > self.opaque * albedo.mean()
 
         def seen(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
@@ -422,10 +431,11 @@ class SurfelModel(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         response = {name: (p.lower, p.upper, p.unit) for name, p in self.laser_sensor.named_children()}
-        return {"response": response, "quadrature": self.quadrature, "lateral": tuple(self.lateral)}
+        own = {"quadrature": self.quadrature, "opaque": self.opaque, "lateral": tuple(self.lateral)}
+        return {"response": response, **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.quadrature = state["quadrature"]
+        self.quadrature, self.opaque = state["quadrature"], state["opaque"]
 
     @classmethod
     def from_state(cls, capture: Capture, state: dict[str, Any]) -> SurfelModel:

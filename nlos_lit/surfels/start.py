@@ -109,5 +109,5 @@ def seed_surfels(
     )
     fit.match_energy()
     scan_shapes = scan_shapes and any(effect.shapes for effect in extension.effects)
-    fit.schedule(plan_from_seeds(s, parts, scan_shapes), s.more)
+    fit.schedule(plan_from_seeds(s, parts, scan_shapes), s.more, lay=True)
     return fit

@@ -254,13 +254,15 @@ def test_uneven_albedos_cost_by_their_ratio():
     assert more - double == pytest.approx(np.log(2) / 0.2, rel=0.1)  # nearly linear far out
 
 
+@pytest.mark.parametrize("opaque", OPAQUE)
 @pytest.mark.parametrize(("share", "hides"), [(0.95, False), (1.05, True)])
-def test_faint_surfels_hide_nothing(share, hides):
+def test_faint_surfels_hide_nothing(opaque, share, hides):
     capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     others = [[x, 0.5, 0.5] for x in (-0.4, 0.4)]
-    # Its own albedo is part of the mean, too: a = share · OPAQUE · (3 + a)/4.
-    albedo = 3 * share * OPAQUE / (4 - share * OPAQUE)
+    # Its own albedo is part of the mean, too: a = share · opaque · (3 + a)/4.
+    albedo = 3 * share * opaque / (4 - share * opaque)
     model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], *others], albedo=[albedo, 1.0, 1.0, 1.0])
+    model.opaque = opaque
     model.update_visibility()
     assert model.visible.tolist() == [[True, not hides, True, True]]
 
