@@ -8,7 +8,7 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from nlos_lit.commands.diagnose import diagnose, prepare
+from nlos_lit.runtime.arguments import begun, look_over
 from nlos_lit.runtime.command_line import sentence_errors
 
 
@@ -16,9 +16,17 @@ from nlos_lit.runtime.command_line import sentence_errors
 @sentence_errors
 def main(config: DictConfig) -> None:
     """Open the command."""
-    diagnose(config)
+    with begun("diagnose", config):
+        from nlos_lit.commands.diagnose import diagnose
+        from nlos_lit.commands.plan import plan
+
+        plan(config)
+        diagnose(config)
 
 
 if __name__ == "__main__":
+    look_over("diagnose", sys.argv, __doc__)
+    from nlos_lit.commands.diagnose import prepare  # after that: it loads torch
+
     prepare(sys.argv)
     main()

@@ -14,11 +14,12 @@ docs=FILE           the page (default: docs/results.md)
 import logging
 import sys
 
-from nlos_lit.commands.results import results
+from nlos_lit.runtime.arguments import look_over
 from nlos_lit.runtime.command_line import sentence_errors
-
-main = sentence_errors(results)
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
-    main(sys.argv[1:])
+    look_over("results", sys.argv, __doc__)
+    from nlos_lit.commands.results import results  # after that: it loads torch
+
+    sentence_errors(results)(sys.argv[1:])

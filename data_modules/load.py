@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pooch
+import yaml
 
+from data_modules.plan import plan_capture
 from data_modules.readers import ReaderOptions, read_capture
 from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_truth, simulate_capture
 from nlos_lit.capture import Capture
@@ -17,6 +20,8 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 
 log = logging.getLogger(__name__)
+SMALLEST, LARGEST = 1e-15, 1e12  # of a capture's largest value; squares of it stand in single precision
+SCENE_CONFIGS = Path(__file__).resolve().parents[1] / "conf" / "scene"
 
 
 def load_scene(
@@ -33,11 +38,13 @@ def load_scene(
         Counts summed and gated as the scene says; the surface as seen from the wall, or None.
 
     Raises:
-        UserError: the data are not there (says where they come from and where to put them) or not usable.
+        UserError: the data are not there (says where they come from and where to put them) or not usable, or
+            their largest value is no count and no intensity.
     """
     if scene["simulate"] is not None and scene["path"] is None:
         capture, truth = _simulate(scene["simulate"], seed)
     else:
+        scene = planned_scene(scene, data_dir)[0]
         path = find_file(scene, Path(data_dir))
         capture, truth = read_capture(path, scene["format"], options=_options(scene["reader"])), None
     if scene["truth"] is not None:
@@ -45,11 +52,58 @@ def load_scene(
     capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
     if scene["gate"] is not None:
         capture = capture.with_gate(*scene["gate"])
+    largest = float(capture.counts.max())
+    if not SMALLEST < largest < LARGEST:
+        raise UserError(
+            f"the capture's largest value is {largest:.3g}; what is computed of values beyond {SMALLEST:g} "
+            f"to {LARGEST:g} is lost in rounding: look for a damaged value, or give values in another unit"
+        )
     return capture, truth
+
+
+def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[str, Any], Capture | None]:
+    """A scene with what it leaves to its data filled in: bins to sum, gate, depths.
+
+    Args:
+        scene: a config of conf/scene; ``sum_bins`` or ``volume.depth`` may be null.
+        data_dir: folder in which downloaded files are looked for.
+
+    Returns:
+        The scene, and the capture as it will be fitted, where it had to be read.
+
+    Raises:
+        UserError: the data are not there, or show no light to plan by.
+    """
+    depth = scene["volume"]["depth"]
+    if scene["sum_bins"] is not None and depth is not None:
+        return dict(scene), None
+    path = find_file(scene, Path(data_dir))
+    capture = read_capture(path, scene["format"], options=_options(scene["reader"]))
+    capture = capture.sum_spots(scene["sum_spots"])
+    plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
+    if depth is None and plan.depth is None:
+        raise UserError(
+            f"{path.name}: no light that comes back stands out of the noise, so the depths of the volume "
+            "cannot be told from the data; give them as 'scene.volume.depth=[NEAR,FAR]' (m)"
+        )
+    volume = {**scene["volume"], "depth": list(plan.depth or ()) if depth is None else depth}
+    planned = {**scene, "sum_bins": plan.sum_bins, "gate": list(plan.gate), "volume": volume}
+    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
+    near, far = volume["depth"]
+    log.info(
+        "plan for %s: %d bins summed to %.3g ps, gate [%d, %d), depth %.3g to %.3g m, planes %.3g mm apart, "
+        "for a wavelength of %.3g cm; scene.sum_bins, scene.gate, scene.volume.depth, "
+        "scene.volume.depth_pitch and scene.wavelength override it",
+        path.name, plan.sum_bins, capture.bin_width_ps, *plan.gate, near, far,
+        1e3 * (volume["depth_pitch"] or plan.depth_pitch), 100 * plan.wavelength,
+    )  # fmt: skip
+    return planned, capture
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
     """The scene's file, downloaded where it is missing and a URL and a checksum are known.
+
+    Only sources of conf/scene are downloaded: a run's folder, whose config says the scene, can be foreign.
 
     Args:
         scene: a config of conf/scene.
@@ -76,6 +130,11 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
     if path.exists():
         return path
     if source["url"] is not None and source["sha256"] is not None:
+        if dict(source) not in shipped_sources():
+            raise UserError(
+                f"{source['url']} is no address of this project's own scenes; nothing is downloaded from it: "
+                f"fetch it by hand, put it at {path}, or give scene.path=FILE"
+            )
         log.info("downloading %s from %s", source["file"], source["url"])
         try:
             fetched = pooch.retrieve(
@@ -92,6 +151,13 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
         f"It comes from {source['origin']}. Download it there and put it at {path}, "
         "or give its place as scene.path=FILE"
     )
+
+
+@functools.cache
+def shipped_sources() -> list[dict[str, Any]]:
+    """Where the data of this project's own scenes come from."""
+    configs = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in SCENE_CONFIGS.glob("*.yaml"))
+    return [config["source"] for config in configs if config.get("source")]
 
 
 def _options(reader: Mapping[str, Any]) -> ReaderOptions:

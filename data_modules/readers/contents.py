@@ -21,6 +21,7 @@ from data_modules.readers.mat5 import list_mat5, read_mat5
 from nlos_lit.capture.errors import CaptureError
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_MOST = 4096  # arrays of a file that are listed
 _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
 
 
@@ -159,11 +160,12 @@ class Contents:
             dataset = file[name]
             if dataset.shape != () or h5py.check_string_dtype(dataset.dtype) is None:
                 return ""
+            self._check_size(name, self.entries[name], 1)  # a single value is never packed
             return dataset[()].decode("utf-8", errors="replace")
 
-    def _check_size(self, name: str, entry: Entry) -> None:
+    def _check_size(self, name: str, entry: Entry, packing: int = _DEFLATE_LIMIT) -> None:
         on_disk = self.path.stat().st_size
-        if entry.size > _DEFLATE_LIMIT * on_disk:
+        if entry.size > packing * on_disk:
             raise CaptureError(
                 f"{name} in {self.path.name} claims {entry.size / 1e6:.0f} MB in a file of "
                 f"{on_disk / 1e6:.3g} MB; "
@@ -197,11 +199,15 @@ def open_contents(path: str | Path) -> Contents:
         CaptureError: nothing there, not readable, damaged, or of no known container.
     """
     path = Path(path)
-    if path.is_dir():
-        return open_folder(path)
-    if not path.exists():
-        raise CaptureError(f"there is no file {path}")
     try:
+        if path.is_dir():
+            return open_folder(path)
+        if not path.exists():
+            raise CaptureError(f"there is no file {path}")
+        if not path.is_file():
+            raise CaptureError(
+                f"{path} is a pipe or a device; a capture is a file, or a folder of .mat files"
+            )
         with path.open("rb") as stream:
             head = stream.read(4096)
     except OSError as error:
@@ -253,6 +259,8 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
             members = {name: item}
             if isinstance(item, h5py.Group):
                 members = {f"{name}.{member}": value for member, value in _hard_links(item)}
+            if len(entries) + len(members) > _MOST:
+                raise CaptureError(f"{path.name} holds more than {_MOST} arrays; a capture holds a few")
             for label, dataset in members.items():
                 if isinstance(dataset, h5py.Dataset) and not dataset.is_virtual and not dataset.external:
                     matlab = matlab or "MATLAB_class" in dataset.attrs
@@ -268,6 +276,8 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
 
 def _hard_links(group: h5py.Group) -> list[tuple[str, h5py.Group | h5py.Dataset]]:
     """What lies in the file itself; links to other places and files are not followed."""
+    if len(group) > _MOST:
+        raise CaptureError(f"a group holds {len(group)} arrays; a capture holds a few")
     return [(name, group[name]) for name in group if isinstance(group.get(name, getlink=True), h5py.HardLink)]
 
 

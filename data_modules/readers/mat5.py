@@ -9,12 +9,13 @@ the interpreter on a damaged file.)
 from __future__ import annotations
 
 import math
-import mmap
+import os
 import struct
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -34,6 +35,7 @@ _TYPES = {
 }  # mi* codes
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15
 _STRUCT, _NUMBERS = 2, range(6, 16)  # mx* classes
+_HEAD = 65536  # bytes that a matrix' name and shape lie in, packed or not
 _INFLATION = 1100  # deflate cannot exceed 1032-fold (zlib.net/zlib_tech.html)
 
 
@@ -60,16 +62,16 @@ def list_mat5(path: Path) -> dict[str, tuple[tuple[int, ...], bool]]:
         ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).
     """
     found: dict[str, tuple[tuple[int, ...], bool]] = {}
-    view = _view(path)
-    order = _order(view)
-    for kind, body in _elements(view[128:], order, aligned=False):
-        variable = _peek(kind, body, order)
-        if variable is None:
-            continue
-        found[variable.name] = (variable.shape, variable.numeric)
-        if variable.kind == _STRUCT and math.prod(variable.shape) == 1:
-            for name, field in _fields(_whole(kind, body, order), order):
-                found[f"{variable.name}.{name}"] = (field.shape, field.numeric)
+    with path.open("rb") as stream:
+        order = _order(stream)
+        for element in _variables(stream, order):
+            variable = _peek(element.kind, element.read(_HEAD), order)
+            if variable is None:
+                continue
+            found[variable.name] = (variable.shape, variable.numeric)
+            if variable.kind == _STRUCT and math.prod(variable.shape) == 1:
+                for name, field in _fields(_whole(element.kind, element.read(), order), order):
+                    found[f"{variable.name}.{name}"] = (field.shape, field.numeric)
     return found
 
 
@@ -88,40 +90,70 @@ def read_mat5(path: Path, name: str) -> np.ndarray:
         ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).
     """
     wanted, _, member = name.partition(".")
-    view = _view(path)
-    order = _order(view)
-    for kind, body in _elements(view[128:], order, aligned=False):
-        variable = _peek(kind, body, order)
-        if variable is None or variable.name != wanted:
-            continue
-        variable = _whole(kind, body, order)
-        if member:
-            variable = dict(_fields(variable, order))[member]
-        return _numbers(variable, order)
+    with path.open("rb") as stream:
+        order = _order(stream)
+        for element in _variables(stream, order):
+            variable = _peek(element.kind, element.read(_HEAD), order)
+            if variable is None or variable.name != wanted:
+                continue
+            variable = _whole(element.kind, element.read(), order)
+            if member:
+                variable = dict(_fields(variable, order))[member]
+            return _numbers(variable, order)
     raise CaptureError(f"{path.name} lost {name} while it was read")
 
 
-def _view(path: Path) -> memoryview:
-    """The file's bytes, mapped and not read; the map lives as long as its views."""
-    with path.open("rb") as stream:
-        return memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+@dataclass(frozen=True)
+class _Element:
+    """A data element of the file: its type, and where its body lies.
+
+    It is read and not mapped: a file that is cut while it is mapped would end the process by SIGBUS.
+    """
+
+    stream: BinaryIO
+    kind: int
+    start: int
+    size: int
+
+    def read(self, most: int | None = None) -> memoryview:
+        """The body, or at ``most`` so many bytes of it."""
+        wanted = self.size if most is None else min(self.size, most)
+        self.stream.seek(self.start)
+        found = self.stream.read(wanted)
+        if len(found) < wanted:
+            raise ValueError(f"an element of {self.size} bytes was cut short while it was read")
+        return memoryview(found)
 
 
-def _order(view: memoryview) -> str:
-    return ">" if bytes(view[126:128]) == b"MI" else "<"
+def _order(stream: BinaryIO) -> str:
+    return ">" if stream.read(128)[126:128] == b"MI" else "<"
 
 
-def _elements(view: memoryview, order: str, aligned: bool = True) -> Iterator[tuple[int, memoryview]]:
-    """Type and body of each data element; bodies inside a matrix are padded to eight bytes."""
+def _variables(stream: BinaryIO, order: str) -> Iterator[_Element]:
+    """The elements of the file itself; compressed ones are not padded."""
+    end, at = os.fstat(stream.fileno()).st_size, 128
+    while at < end:
+        stream.seek(at)
+        kind, start, size, after = _tag(memoryview(stream.read(8)), 0, order, end - at)
+        yield _Element(stream, kind, at + start, size)
+        at += after if kind != _COMPRESSED else start + size
+
+
+def _elements(view: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
+    """Type and body of each data element inside a matrix; bodies are padded to eight bytes."""
     at = 0
     while at < len(view):
         kind, start, size, after = _tag(view, at, order)
         yield kind, view[start : start + size]
-        at = after if aligned or kind != _COMPRESSED else start + size
+        at = after
 
 
-def _tag(view: memoryview, at: int, order: str) -> tuple[int, int, int, int]:
-    """Type, start and size of the body at ``at``, and where the next element begins."""
+def _tag(view: memoryview, at: int, order: str, end: int | None = None) -> tuple[int, int, int, int]:
+    """Type, start and size of the body at ``at``, and where the next element begins.
+
+    Bodies end before ``end``; None: with the view.
+    """
+    end = len(view) if end is None else end
     if at + 8 > len(view):
         raise ValueError("an element's tag lies beyond the end")
     first, size = struct.unpack_from(f"{order}II", view, at)
@@ -132,15 +164,15 @@ def _tag(view: memoryview, at: int, order: str) -> tuple[int, int, int, int]:
     else:
         kind, start = first, at + 8
         after = start + size + -size % 8
-    if start + size > len(view):
-        raise ValueError(f"an element of {size} bytes where {len(view) - start} are left")
+    if start + size > end:
+        raise ValueError(f"an element of {size} bytes where {end - start} are left")
     return kind, start, size, after
 
 
 def _peek(kind: int, body: memoryview, order: str) -> Variable | None:
     """A top-level matrix' name and shape, unpacking no more than its head; None for other elements."""
     if kind == _COMPRESSED:
-        head = memoryview(zlib.decompressobj().decompress(body, 65536))
+        head = memoryview(zlib.decompressobj().decompress(body, _HEAD))
         if len(head) < 8:
             raise ValueError("a compressed variable is cut short")
         inner, _ = struct.unpack_from(f"{order}II", head)

@@ -12,6 +12,7 @@ import numpy as np
 
 from nlos_lit.capture.errors import CaptureError
 
+_LARGEST = 2**30  # bytes of a picture
 _SIZE_LINE = re.compile(rb"-Y (\d{1,9}) \+X (\d{1,9})\n")
 
 
@@ -27,6 +28,9 @@ def read_radiance(path: Path) -> np.ndarray:
     Raises:
         CaptureError: no size line, another orientation, a picture cut short, or a broken run.
     """
+    on_disk = path.stat().st_size
+    if on_disk > _LARGEST:
+        raise CaptureError(f"{path.name} has {on_disk / 1e9:.1f} GB; no picture of a transient is so large")
     data = path.read_bytes()
     header = data[:65536]
     size = _SIZE_LINE.search(header)
@@ -38,7 +42,8 @@ def read_radiance(path: Path) -> np.ndarray:
     if rows < 1 or columns < 1:
         raise CaptureError(f"{path.name} is a picture of {rows} × {columns} pixels")
     body = memoryview(data)[size.end() :]
-    least = 4 * (2 * (columns // 127)) if 8 <= columns < 32768 else 4 * columns
+    # A packed row has four bytes before it, and in each of four channels two for a run of at most 127 pixels.
+    least = 4 + 8 * -(-columns // 127) if 8 <= columns < 32768 else 4 * columns
     if rows * least > len(body):
         raise CaptureError(
             f"{path.name} is cut short: {len(body)} bytes cannot hold {rows} × {columns} pixels"

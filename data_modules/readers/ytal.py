@@ -15,7 +15,16 @@ from data_modules.readers.assemble import COMMON_OPTIONS, assemble, remove_delay
 from data_modules.readers.contents import Contents, open_contents
 from data_modules.readers.frame import device_distances, wall_rotation
 from data_modules.readers.options import ReaderOptions
-from data_modules.readers.ytal_write import OBSERVED, T_LI_SI, T_LX_LY_SX_SY, T_SI, T_SX_SY, own_facts
+from data_modules.readers.ytal_write import (
+    OBSERVED,
+    T_LI_SI,
+    T_LX_LY_SX_SY,
+    T_SI,
+    T_SX_SY,
+    layout,
+    own_facts,
+    whole,
+)
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
@@ -28,6 +37,7 @@ EXPECTS = "H, delta_t, sensor_grid_xyz and laser_grid_xyz"
 OPTIONS = COMMON_OPTIONS | {"raw_scale"}
 _AXES = {T_SX_SY: 3, T_LX_LY_SX_SY: 5, T_SI: 2, T_LI_SI: 3}
 _KEPT_TEXT = 16_384
+_ALTERED = "the file was altered: without its line 'nlos_lit: …' it is read as any y-tal file"
 
 
 def matches(contents: Contents) -> bool:
@@ -74,7 +84,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         "bin_length": length,
     }
     if ours is not None:
-        return _own(path, options, ours, counts, geometry, t_start, _observed(contents))
+        axes = contents.entries["H"].shape[1:]
+        return _own(path, options, ours, counts, axes, geometry, t_start, _observed(contents))
     steps: list[str] = []
     devices = {name: _device(contents, name) for name in ("laser_xyz", "sensor_xyz")}
     if contents.ndim("t_accounts_first_and_last_bounces") >= 0 and contents.scalar(
@@ -122,25 +133,47 @@ def _own(
     options: ReaderOptions,
     ours: dict[str, Any],
     counts: np.ndarray,
+    axes: tuple[int, ...],
     geometry: dict[str, Any],
     t_start: float,
     observed: np.ndarray | None,
 ) -> Capture:
-    """What `write_capture` wrote, exactly as it was, then the options."""
+    """What `write_capture` wrote, exactly as it was, then the options.
+
+    The facts are held against the arrays: a file that says both was altered where they disagree.
+    """
     if options.raw_scale is not None:
         raise CaptureError(
             f"raw_scale has no meaning for {path.name}: it was written by this project, free of that scale"
         )
+    dtype = ours.pop("dtype")
+    if not _holds(dtype, counts):
+        raise CaptureError(
+            f"H in {path.name} holds {counts.min():g} to {counts.max():g}, which {dtype} does not hold as "
+            f"scene_info says; {_ALTERED}"
+        )
+    if ours["is_counts"] and not whole(counts):
+        raise CaptureError(
+            f"H in {path.name} holds values that are no whole numbers where scene_info says photon counts; "
+            f"{_ALTERED}"
+        )
     provenance = ours.pop("provenance")
     fields = {
         **geometry,
-        "counts": counts.astype(ours.pop("dtype")),
+        "counts": counts.astype(dtype),
         "t_start": t_start,
         "gate": ours.pop("gate"),
         "observed": observed,
     }
+    capture = Capture(**fields, **ours, provenance=provenance)
+    written = layout(capture)[1]
+    if written != axes:
+        raise CaptureError(
+            f"H in {path.name} has spots {axes} where scan_shape {capture.scan_shape} of scene_info would be "
+            f"written as {written}; {_ALTERED}"
+        )
     if not options.given:
-        return Capture(**fields, **ours, provenance=provenance)
+        return capture
     shape = ours.pop("scan_shape")
     steps = provenance.pop("steps", [])
     return assemble(
@@ -154,6 +187,16 @@ def _own(
         steps=steps,
         facts=provenance,
     )
+
+
+def _holds(dtype: str, values: np.ndarray) -> bool:
+    """Whether a type holds these values as they are."""
+    kind = np.dtype(dtype)
+    if kind.kind in "ui":
+        limits = np.iinfo(kind)
+        return whole(values) and values.min() >= limits.min and values.max() < limits.max + 1
+    with np.errstate(over="ignore"):
+        return np.array_equal(values.astype(kind), values, equal_nan=True)
 
 
 def _observed(contents: Contents) -> np.ndarray | None:

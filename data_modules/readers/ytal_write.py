@@ -6,14 +6,13 @@ What y-tal has no place for goes into ``scene_info``.
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
+from data_modules.whole_hdf5 import whole_hdf5
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import CaptureError
 
@@ -47,7 +46,7 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
 
     Raises:
         CaptureError: the file exists and ``overwrite`` is false, it cannot be written, counts that float32
-            cannot hold, or provenance that is not JSON.
+            cannot hold or that are no whole numbers, or provenance that is not JSON.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -59,7 +58,9 @@ def write_capture(path: str | Path, capture: Capture, *, overwrite: bool = False
         raise CaptureError(
             "counts above 16777216 do not fit y-tal's float32; split the exposure or sum fewer bins"
         )
-    kind, shape, laser, sensor = _layout(capture)
+    if capture.is_counts and not whole(values):
+        raise CaptureError("photon counts are whole numbers; a capture of other values has is_counts=False")
+    kind, shape, laser, sensor = layout(capture)
     items: dict[str, Any] = {
         "H": np.ascontiguousarray(values.T).reshape(capture.n_bins, *shape),
         "H_format": np.array([kind], dtype=np.int32),
@@ -158,7 +159,12 @@ def _facts(capture: Capture) -> str:
         raise CaptureError(f"the capture's provenance cannot be written as JSON: {error}") from error
 
 
-def _layout(capture: Capture) -> tuple[int, tuple[int, ...], np.ndarray, np.ndarray]:
+def whole(values: np.ndarray) -> bool:
+    """Whether all are whole numbers."""
+    return values.dtype.kind in "ui" or bool((values == np.rint(values)).all())
+
+
+def layout(capture: Capture) -> tuple[int, tuple[int, ...], np.ndarray, np.ndarray]:
     """H_format, the axes of H after time, and the capture rows that give the laser and sensor grids."""
     rows, shape = np.arange(capture.n_spots), capture.scan_shape
     one_laser, one_sensor = (bool((points == points[0]).all()) for points in (capture.laser, capture.sensor))
@@ -192,20 +198,8 @@ def _is_product(capture: Capture, lasers: np.ndarray, sensors: np.ndarray) -> bo
 
 
 def _write(path: Path, items: dict[str, Any]) -> None:
-    try:
-        handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    except OSError as error:
-        raise CaptureError(f"cannot write {path}: {error.strerror or error}") from error
-    os.close(handle)
-    try:
-        with h5py.File(partial, "w") as file:
-            for name, value in items.items():
-                packed = name in ("H", OBSERVED)
-                options = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if packed else {}
-                file.create_dataset(name, data=value, **options)
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    except OSError as error:
-        raise CaptureError(f"cannot write {path}: {error}") from error
-    finally:
-        Path(partial).unlink(missing_ok=True)
+    with whole_hdf5(path) as file:
+        for name, value in items.items():
+            packed = name in ("H", OBSERVED)
+            options = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if packed else {}
+            file.create_dataset(name, data=value, **options)

@@ -10,6 +10,7 @@ import numpy as np
 
 from data_modules.simulate.mesh import Mesh
 from data_modules.simulate.visibility import Occluder
+from data_modules.whole_hdf5 import whole_hdf5
 from nlos_lit.capture.errors import UserError
 
 
@@ -87,8 +88,11 @@ def save_truth(path: str | Path, truth: Truth) -> None:
     Args:
         path: where to; a file there is replaced.
         truth: what to write.
+
+    Raises:
+        CaptureError: it cannot be written.
     """
-    with h5py.File(path, "w") as file:
+    with whole_hdf5(Path(path)) as file:
         for name in ("x", "y", "depth", "normal", "albedo", "clean", "expected"):
             values = getattr(truth, name)
             if values is not None:

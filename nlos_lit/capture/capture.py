@@ -8,6 +8,8 @@ t_start + (k+1)·bin_length)``.
 from __future__ import annotations
 
 import dataclasses
+import hashlib
+import math
 from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
@@ -66,8 +68,9 @@ class Capture:
             zeros included. None means everywhere. Elsewhere ``counts`` are zero and say nothing.
 
     Raises:
-        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, the gate is
-            empty or none of its bins was recorded, or counts lie in bins that were not recorded.
+        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, the exposure
+            is no time, the gate is empty or none of its bins was recorded, or counts lie in bins that were
+            not recorded.
 
     Examples:
         A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:
@@ -127,6 +130,8 @@ class Capture:
             raise CaptureError(f"bin_length must be a positive length in metres; found {self.bin_length}")
         if not np.isfinite(self.t_start):
             raise CaptureError(f"t_start must be finite; found {self.t_start}")
+        if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
+            raise CaptureError(f"exposure_s must be a positive number of seconds; found {self.exposure_s}")
         _check_counts(self.counts)
         first, last = (0, bins) if self.gate is None else (int(self.gate[0]), int(self.gate[1]))
         if not 0 <= first < last <= bins:
@@ -217,6 +222,28 @@ class Capture:
         spots = self.observed.sum(axis=0)
         total = self.counts.sum(axis=0, dtype=np.float64)
         return np.divide(total, spots, out=np.full(self.n_bins, np.nan), where=spots > 0)
+
+    def digest(self) -> str:
+        """SHA-256 of all that a fit reads: counts, scan, times, gate; places to the digits of float32.
+
+        Examples:
+            >>> import numpy as np
+            >>> one, up = np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]])
+            >>> capture = Capture(np.array([[1, 2, 3]]), one, one, up, up, bin_length=0.01)
+            >>> capture.digest() == capture.with_gate(0, 3).digest()
+            True
+            >>> capture.digest() == capture.with_gate(0, 2).digest()
+            False
+        """
+        times = tuple(float(np.float32(value)) for value in (self.bin_length, self.t_start))
+        facts = (self.counts.dtype.str, self.counts.shape, times, self.gate, self.scan_shape, self.is_counts)
+        found = hashlib.sha256(repr(facts).encode())
+        places = (self.laser, self.sensor, self.laser_normal, self.sensor_normal)
+        for array in (self.counts, *(p.astype(np.float32) for p in places), self.scan_order):
+            found.update(np.ascontiguousarray(array).data)
+        if self.observed is not None:
+            found.update(np.packbits(self.observed).data)
+        return found.hexdigest()
 
     def with_counts(self, counts: np.ndarray, **changes: Any) -> Capture:
         """The same scan with other counts, such as drawn ones; what was not recorded stays zero.

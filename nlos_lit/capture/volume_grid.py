@@ -138,7 +138,8 @@ def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
         Lower and upper bound of the path lengths, m.
 
     Raises:
-        CaptureError: no such path falls inside the capture's gate, so nothing of the volume was measured.
+        CaptureError: no such path falls inside the capture's gate, so nothing of the volume was measured, or
+            the volume holds points of the wall.
     """
     lower = np.array([min(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
     upper = np.array([max(axis[0], axis[-1]) for axis in (grid.x, grid.y, grid.z)])
@@ -149,6 +150,13 @@ def path_range(capture: Capture, grid: VolumeGrid) -> tuple[float, float]:
         longest = longest + np.linalg.norm(np.maximum(np.abs(below), np.abs(above)), axis=1)
     first, last = capture.path_gate
     shortest, longest = float(np.min(shortest)), float(np.max(longest))
+    if shortest == 0:
+        wall = np.concatenate([capture.laser[:, 2], capture.sensor[:, 2]])
+        raise CaptureError(
+            f"the volume (z = {grid.z.min():.3g} to {grid.z.max():.3g} m) holds points of the wall, which "
+            f"lie at z = {wall.min():.3g} to {wall.max():.3g} m: begin deeper (scene.volume.depth), or turn "
+            "the positions so that the wall lies near z = 0"
+        )
     if shortest >= last or longest <= first:
         raise CaptureError(
             f"the volume (depth {grid.z.min():.3g} to {grid.z.max():.3g} m, light paths {shortest:.3g} to "

@@ -8,10 +8,9 @@ import shutil
 import sys
 import time
 from pathlib import Path
-from typing import Any, cast
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
@@ -22,26 +21,23 @@ from nlos_lit.model.build import PipelineSettings
 from nlos_lit.report.diagnosis_figures import diagnosis_figures
 from nlos_lit.report.page import log_figures, write_report
 from nlos_lit.report.verdict import verdict
-from nlos_lit.runtime.command_line import (
-    output_folder,
-    quote_numbers,
-    refuse_finished_folder,
-    stay_in_run,
-    write_config,
-)
+from nlos_lit.runtime.claim import claim
+from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors, stay_in_run
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.runtime.progress import StepTicker
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import register_settings, settings_of
+from nlos_lit.training.folder import resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.run_folder import Run, open_run
 
 log = logging.getLogger(__name__)
 
 
+@sentence_errors
 def prepare(arguments: list[str]) -> None:
     """What must be done before Hydra reads the command line ``arguments``, in place."""
     quote_numbers(arguments)
-    refuse_finished_folder(arguments[1:], diagnosis=True)
+    take_given_folder(arguments[1:])
     stay_in_run(arguments)
     register_settings()
 
@@ -56,15 +52,16 @@ def diagnose(config: DictConfig) -> None:
     folder = output_folder()
     if config.threads:
         torch.set_num_threads(config.threads)
-    run = None
+    run, settings = None, resolved(config)
     if config.run is None:
-        settings = write_config(config, folder)
+        take_folder(folder)
+        write_config(settings, folder)
         scene, model = settings["scene"], settings["model"]
         capture = load_scene(scene, settings["data_dir"], settings["seed"])[0]
     else:
         folder = Path(config.run)
+        claim(folder)
         run = _undiagnosed(folder)
-        settings = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True))
         scene, model, capture = run.config["scene"], run.config["model"], run.capture
     options = settings_of(CriticismSettings, settings["criticism"], "criticism")
     pipeline = BasePipeline(

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from data_modules.examine import describe, examine
 from data_modules.readers import READERS, ReaderOptions, detect_format, read_capture
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import UserError, printable
 from nlos_lit.report.capture_figure import draw_capture
 
 
 def inspect_capture(arguments: list[str]) -> int:
     """Print what the file named by ``arguments`` holds, draw it, and return the exit status."""
-    given = _parser().parse_args(arguments).__dict__
+    given = parse(arguments).__dict__
     path, fmt, out = given.pop("file"), given.pop("format"), given.pop("out")
     size, gate = given.pop("wall_size"), given.pop("gate")
     try:
@@ -22,7 +22,7 @@ def inspect_capture(arguments: list[str]) -> int:
         options = ReaderOptions(wall_size=wall_size, gate=tuple(gate) if gate else None, **given)
         capture = read_capture(path, fmt, options=options)
         findings = examine(capture)
-        print(describe(capture, detect_format(path) if fmt == "auto" else fmt, findings))
+        print(printable(describe(capture, detect_format(path) if fmt == "auto" else fmt, findings)))
         picture = out / f"{path.stem}_capture.png"
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -34,6 +34,11 @@ def inspect_capture(arguments: list[str]) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """What the command line says."""
+    return _parser().parse_args(arguments)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -17,17 +17,20 @@ from nlos_lit.io.volumes import write_volume
 from nlos_lit.metrics.geometry import geometry_errors
 from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
-from nlos_lit.runtime.command_line import output_folder, quote_numbers, refuse_finished_folder, write_config
-from nlos_lit.runtime.memory import check_machine, parse_bytes, peak_bytes
+from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors
+from nlos_lit.runtime.memory import check_disk, check_machine, parse_bytes, peak_bytes
+from nlos_lit.training.folder import register_names, resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.summary import git_state, versions
 
 log = logging.getLogger(__name__)
 
 
+@sentence_errors
 def prepare(arguments: list[str]) -> None:
     """What must be done before Hydra reads the command line ``arguments``, in place."""
     quote_numbers(arguments)
-    refuse_finished_folder(arguments[1:])
+    take_given_folder(arguments[1:])
+    register_names()
 
 
 def reconstruct(config: DictConfig) -> None:
@@ -38,12 +41,15 @@ def reconstruct(config: DictConfig) -> None:
     """
     began = time.perf_counter()
     folder = output_folder()
-    settings = write_config(config, folder)
+    take_folder(folder)
+    settings = resolved(config)
+    write_config(settings, folder)
     scene, method = settings["scene"], settings["method"]
     capture, truth = load_scene(scene, settings["data_dir"], settings["seed"])
     grid = volume_grid(capture, **scene["volume"])
     needed = estimate_bytes(capture, grid, method["name"])
     check_machine(needed, f"method={method['name']}")
+    check_disk(folder, 4 * grid.n_voxels, "volume.h5")
     log.info(
         "%s: volume %d x %d x %d voxels, about %.2f GiB",
         method["name"],

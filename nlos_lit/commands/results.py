@@ -6,7 +6,7 @@ import logging
 import time
 from pathlib import Path
 
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.paper.experiments import EXPERIMENTS
 from nlos_lit.paper.page import update_page
 from nlos_lit.paper.subjects import SIZES
@@ -44,8 +44,7 @@ def parse(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
             wanted |= set(EXPERIMENTS)
         else:
             raise UserError(
-                f"cannot use {argument!r}: names are {', '.join(EXPERIMENTS)}, all and page; "
-                f"options {', '.join(DEFAULTS)}"
+                f"cannot use {argument!r}; {suggest(key, [*EXPERIMENTS, 'all', 'page', *DEFAULTS])}"
             )
     if not wanted:
         raise UserError(f"name what to make: {', '.join(EXPERIMENTS)}, all or page")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -29,7 +30,8 @@ from data_modules.simulate import (
     simulate_capture,
 )
 from nlos_lit.capture.errors import UserError
-from nlos_lit.effects import EFFECTS
+from nlos_lit.runtime.arguments import check_assignments
+from nlos_lit.runtime.memory import check_disk
 from nlos_lit.surfels.measure import measure
 
 SCENE_HELP = (
@@ -70,19 +72,12 @@ class Options:
     effects: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if not 0 < self.exposure < float("inf"):
-            raise UserError(f"exposure must be above 0; found {self.exposure}")
-        if self.random is not None and self.random < 0:
-            raise UserError(f"random is a seed, 0 or above; found {self.random}")
         named = ["scene"] if self.scene != "default" else []
         named += [name for name in ("bodies", "random") if getattr(self, name) is not None]
         if len(named) > 1:
             raise UserError(f"found {' and '.join(named)}; each is a whole scene, so give one of them")
         if self.mesh is not None and named != ["scene"]:
             raise UserError(f"found mesh={self.mesh} without scene=mesh or scene=two_albedo; {SCENE_HELP}")
-
-
-SECTIONS = (Options, ScanPlan, SensorModel)
 
 
 def strengths(arguments: list[str]) -> dict[str, float]:
@@ -112,19 +107,11 @@ def parse(arguments: list[str]) -> tuple[Options, ScanPlan, SensorModel]:
         ('letters', 8, ['pile_up'])
     """
     arguments = [argument for argument in arguments if "." not in argument.partition("=")[0]]
-    names = [{field.name: field.default for field in dataclasses.fields(section)} for section in SECTIONS]
-    keys = ", ".join(f"{key}={value}" for section in names for key, value in section.items())
+    check_assignments("simulate", arguments)
     given = dict(argument.partition("=")[::2] for argument in arguments)
     for key in {"effects", "bodies"} & set(given):
         if not given[key].startswith("["):
             given[key] = f"[{given[key]}]"
-    for key in given:
-        if not any(key in section for section in names):
-            raise UserError(
-                f"there is no option {key!r}; the options are key=value, with these defaults: {keys}\n"
-                f"{SCENE_HELP}\n"
-                f"effects are {', '.join(EFFECTS.names)}, their strengths EFFECT.PARAMETER=VALUE"
-            )
     options = cast(Options, _filled(Options, given))
     drawn = None if options.random is None else draw_scene(options.random)
     scan = cast(ScanPlan, _filled(drawn.scan if drawn else ScanPlan, given))
@@ -207,6 +194,7 @@ def simulate(arguments: list[str]) -> None:
     for file in (out, truth_file):
         if file.exists() and not options.overwrite:
             raise UserError(f"{file} is already there; take another name or say overwrite=true")
+    check_disk(out.parent, math.prod(scan.scan_shape) * scan.n_bins, str(out))  # packed, about a byte a bin
     mesh, bodies = build(options)
     if options.random is not None:
         print(one_line(bodies))

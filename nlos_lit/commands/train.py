@@ -3,40 +3,45 @@
 from __future__ import annotations
 
 import logging
+import math
 import shlex
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import lightning as L
 import torch
-from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.model.laser_sensor import LaserSensor
-from nlos_lit.runtime.command_line import (
-    output_folder,
-    quiet_libraries,
-    quote_numbers,
-    refuse_finished_folder,
-    write_config,
-)
+from nlos_lit.runtime.command_line import output_folder, quiet_libraries, quote_numbers, sentence_errors
+from nlos_lit.runtime.memory import check_disk
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import register_settings, run_config
+from nlos_lit.training.folder import (
+    OVERRIDES,
+    begin_training,
+    goes_on_in,
+    resolved,
+    resume_run,
+    take_folder,
+    take_given_folder,
+)
 from nlos_lit.training.instantiate import build_all, builder
+from nlos_lit.training.origin import IMAGE, START, SURFACE, check_origin, finished_checkpoint
 from nlos_lit.training.outcome import write_results, write_surface_summary
 from nlos_lit.training.run_folder import (
     Run,
     field_shards,
     find_checkpoint,
-    fitted_of,
     load_fitted,
     prepare_run,
+    run_disk_bytes,
 )
 from nlos_lit.training.surface_fitting import SurfaceFitting
 from nlos_lit.training.surface_run import prepare_surface, write_surface
@@ -45,10 +50,12 @@ log = logging.getLogger(__name__)
 C = TypeVar("C", bound=L.Callback)
 
 
+@sentence_errors
 def prepare(arguments: list[str]) -> None:
     """What must be done before Hydra reads the command line ``arguments``, in place."""
     quote_numbers(arguments)
-    refuse_finished_folder(arguments[1:])
+    resume_run(arguments)
+    take_given_folder(arguments[1:])
     register_settings()
 
 
@@ -63,20 +70,28 @@ def train(config: DictConfig) -> None:
     began = time.perf_counter()
     quiet_libraries()
     folder = output_folder()
+    take_folder(folder, goes_on_in(folder, config.ckpt_path))
     alone = config.fit == "surface"
     if alone and config.run is not None:
         config.model = run_config(config.run)["model"]  # the image is formed as it was there
     place = "refined/checkpoints" if alone else "checkpoints"
     checkpoint = find_checkpoint(config.ckpt_path, folder, config.scene.name, place)
     config.folder = str(folder)
-    settings = write_config(config, folder)
+    settings = resolved(config)
     L.seed_everything(settings["seed"], verbose=False)
     if settings["threads"]:
         torch.set_num_threads(settings["threads"])
     config.folder = str(folder / "refined")
-    of_surface = surface_settings(cast(dict[str, Any], OmegaConf.to_container(config, resolve=True)), alone)
+    of_surface = surface_settings(resolved(config), alone)
     fit = _surface_alone if alone else _self_calibration
-    summary = fit(settings, of_surface, folder, checkpoint, began)
+    try:
+        summary = fit(settings, of_surface, folder, checkpoint, began)
+    except KeyboardInterrupt:
+        if (folder / OVERRIDES).exists():
+            log.info("interrupted; go on with: python train.py %s", shlex.quote(f"resume={folder}"))
+        else:
+            log.info("interrupted before the first iteration; begin again with the same command")
+        sys.exit(130)
     if summary is not None:
         _tell(summary, folder)
 
@@ -93,8 +108,11 @@ def _self_calibration(
     trainer = make_trainer(settings)
     history = callback_of(trainer, History)
     callback_of(trainer, ScoreHeldout)
-    run = prepare_run(settings, device_of(settings), field_shards(settings))
-    fit_or_leave(trainer, run.module, run, checkpoint, folder)
+    run = prepare_run(settings, device_of(settings), field_shards(settings), opened(checkpoint, IMAGE))
+    if trainer.is_global_zero:
+        check_disk(folder, run_disk_bytes(run.module.pipeline.phasor.grid.n_voxels), "this run")
+        begin_training(settings, folder, checkpoint)
+    fit_or_leave(trainer, run.module, run, checkpoint)
     if trainer.checkpoint_callbacks:  # also where the last iteration is none of every n-th
         trainer.save_checkpoint(folder / "checkpoints" / "last.ckpt")
     run.module.pipeline.phasor.hold()  # with the processes that end here
@@ -104,6 +122,8 @@ def _self_calibration(
     if settings["refine"] or settings["effects"]:
         begun = folder / "refined" / "checkpoints" / "last.ckpt"
         goes_on = checkpoint is not None and history.ran == 0 and begun.exists()
+        if goes_on:
+            check_origin(begun, run.origin, SURFACE)
         refined = _surface(run, of_surface, folder, begun if goes_on else None)[0]
     return write_results(run, history, folder, time.perf_counter() - began, refined)
 
@@ -112,9 +132,11 @@ def _surface_alone(
     settings: dict[str, Any], of_surface: dict[str, Any], folder: Path, checkpoint: Path | None, began: float
 ) -> dict[str, Any]:
     """The surface of the phasor image with start values, or of the image of a finished run."""
-    source = None if settings["run"] is None else fitted_of(Path(settings["run"]), settings)
+    source = None if settings["run"] is None else finished_checkpoint(Path(settings["run"]))
     make_trainer(of_surface)  # what cannot work is said before the image is formed
-    run = prepare_run(settings, device_of(settings))
+    opens = {**opened(source, START), **opened(checkpoint, SURFACE)}
+    run = prepare_run(settings, device_of(settings), opens=opens)
+    begin_training(settings, folder, checkpoint)
     if source is not None:
         load_fitted(run, source)
     run.module.pipeline.phasor.hold()
@@ -136,7 +158,7 @@ def _surface(
     history = callback_of(trainer, History)
     callback_of(trainer, ScoreHeldout)
     module = prepare_surface(run, response)
-    fit_or_leave(trainer, module, run, checkpoint, folder)
+    fit_or_leave(trainer, module, run, checkpoint)
     if trainer.checkpoint_callbacks:
         trainer.save_checkpoint(folder / "refined" / "checkpoints" / "last.ckpt")
     return write_surface(run, module, folder / "refined", began), module, history
@@ -171,28 +193,37 @@ def device_of(settings: Mapping[str, Any]) -> str:
     return "cuda" if settings["trainer"]["accelerator"] in ("gpu", "cuda") else "cpu"
 
 
-def fit_or_leave(
-    trainer: L.Trainer, module: L.LightningModule, run: Run, checkpoint: Path | None, folder: Path
-) -> None:
-    """Fit; where the user interrupts that, say how to go on and end the process.
+def opened(checkpoint: Path | None, sections: Sequence[str]) -> dict[Path, Sequence[str]]:
+    """As :func:`~nlos_lit.training.run_folder.prepare_run` takes it.
+
+    Args:
+        checkpoint: that is opened, if any.
+        sections: of settings that it must share.
+
+    Returns:
+        one entry or none.
+    """
+    return {} if checkpoint is None else {checkpoint: sections}
+
+
+def fit_or_leave(trainer: L.Trainer, module: L.LightningModule, run: Run, checkpoint: Path | None) -> None:
+    """Fit.
 
     Args:
         trainer: as :func:`make_trainer` gives it.
         module: that is fitted.
         run: whose data are taken.
         checkpoint: to go on from.
-        folder: of the run.
+
+    Raises:
+        KeyboardInterrupt: the user stopped it.
     """
     try:
         trainer.fit(
             module, datamodule=run.data, ckpt_path=checkpoint, weights_only=True if checkpoint else None
         )
-    except SystemExit:  # Lightning's answer to Ctrl-C
-        given = HydraConfig.get().overrides.task
-        again = ["ckpt_path=last", f"hydra.run.dir={folder}"]
-        kept = [override for override in given if not override.startswith("ckpt_path=")]
-        log.info("interrupted; go on with: %s", shlex.join(["python", "train.py", *kept, *again]))
-        sys.exit(130)
+    except SystemExit as stopped:  # Lightning's answer to Ctrl-C
+        raise KeyboardInterrupt from stopped
 
 
 def make_trainer(settings: Mapping[str, Any]) -> L.Trainer:
@@ -240,9 +271,10 @@ def callback_of(trainer: L.Trainer, kind: type[C]) -> C:
 
 def _tell(summary: Mapping[str, Any], folder: Path) -> None:
     nmse, loss, refined = summary["heldout"]["nmse"], summary["loss"], summary["refined"]
+    noise = f" (noise {nmse['noise_floor']:.4f})" if math.isfinite(nmse["noise_floor"]) else ""
     log.info(
-        "held-out NMSE %.4f -> %.4f (noise %.4f), loss %.3e -> %.3e; results in %s",
-        nmse["initial"], nmse["final"], nmse["noise_floor"], loss["initial"], loss["final"], folder,
+        "held-out NMSE %.4f -> %.4f%s, loss %.3e -> %.3e; results in %s",
+        nmse["initial"], nmse["final"], noise, loss["initial"], loss["final"], folder,
     )  # fmt: skip
     if refined is not None:
         log.info("refined by %d surfels: held-out NMSE %.4f", refined["surfels"], refined["heldout"]["nmse"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
@@ -68,5 +68,5 @@ def build_effects(names: Iterable[str], scan: Scan) -> list[Effect]:
     wanted, known = set(names), EFFECTS.names
     unknown = sorted(wanted - set(known))
     if unknown:
-        raise UserError(f"there is no effect {', '.join(map(repr, unknown))}; choose from {', '.join(known)}")
+        raise UserError(f"there is no effect {', '.join(map(repr, unknown))}; {suggest(unknown[0], known)}")
     return [effect(scan) for effect in EFFECTS if effect.name in wanted]

@@ -1,7 +1,7 @@
 """Whole files, and JSON.
 
-Every writer of results fills a hidden file beside its target and renames it: an interrupt leaves the old file
-or none, never half a file.
+Every writer of results fills a hidden file beside its target, waits until it is on the disk, and renames it:
+an interrupt or a full disk leaves the old file or none, never half a file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,12 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     partial = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
     try:
         yield partial
+        with partial.open("rb") as written:
+            os.fsync(written.fileno())
         os.replace(partial, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)  # a write that fails names none
+        raise
     finally:
         partial.unlink(missing_ok=True)
 

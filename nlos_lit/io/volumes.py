@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import h5py
@@ -27,6 +28,7 @@ def write_volume(
 
     Raises:
         ValueError: ``values`` or an extra volume is not of the grid's shape.
+        UserError: one of them holds NaN or infinite values; nothing is written.
 
     Examples:
         >>> import tempfile
@@ -41,7 +43,14 @@ def write_volume(
     for name, array in volumes.items():
         if np.shape(array) != tuple(grid.shape):
             raise ValueError(f"{name} has shape {np.shape(array)}, its grid {tuple(grid.shape)}")
-    with whole_file(path) as partial, h5py.File(partial, "w") as file:
+        wrong = np.size(array) - np.count_nonzero(np.isfinite(array))
+        if wrong:
+            raise UserError(
+                f"{wrong} of {np.size(array)} voxels of the {name} are NaN or infinite, which is no result: "
+                "look for damaged values in the capture, or change the settings that led there"
+            )
+    content = io.BytesIO()  # HDF5 does not survive a disk that becomes full under its hands
+    with h5py.File(content, "w") as file:
         file.attrs["frame"] = (
             "relay wall near z = 0, hidden scene at z > 0, right-handed, +y up; x, y, z are voxel centres"
         )
@@ -55,6 +64,8 @@ def write_volume(
             file.create_dataset(name, data=single, compression="gzip", compression_opts=1, shuffle=True)
             file[name].attrs["unit"] = "1"
             file[name].attrs["axes"] = "z, x, y"
+    with whole_file(path) as partial:
+        partial.write_bytes(content.getbuffer())
 
 
 def read_volume(path: Path | str) -> tuple[np.ndarray, VolumeGrid, dict[str, np.ndarray]]:

@@ -290,6 +290,7 @@ def _settings(path: Path, depth: tuple[float, float, float], threshold: float) -
         "scene=capture",
         f"scene.path={path.resolve()}",
         f"scene.truth={truth.resolve()}",
+        "scene.sum_bins=1",
         f"scene.volume.depth=[{near},{far}]",
         f"scene.volume.depth_pitch={pitch}",
         f"scene.threshold={threshold}",

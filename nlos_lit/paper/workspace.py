@@ -25,6 +25,7 @@ from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.io.files import whole_file
 from nlos_lit.training.configs import compose
+from nlos_lit.training.folder import OVERRIDES
 
 log = logging.getLogger(__name__)
 
@@ -207,7 +208,7 @@ class Workspace:
         if (folder / "summary.json").exists():
             return folder
         checkpoint = []
-        if (folder / "checkpoints" / "last.ckpt").exists():
+        if (folder / OVERRIDES).exists():
             checkpoint = ["ckpt_path=last"]
         elif start is not None:
             checkpoint = [f"ckpt_path={start}/checkpoints/last.ckpt"]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from nlos_lit.capture import Capture
+from nlos_lit.io.files import whole_file
 
 NOT_RECORDED = "0.7"  # grey
 
@@ -59,7 +60,8 @@ def draw_capture(capture: Capture, mean_transient: np.ndarray, totals: np.ndarra
         counts[:, peak].astype(np.float64),
         f"bin {peak}, path {way[peak]:.3f} m",
     )
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as partial:
+        figure.savefig(partial, dpi=110)
     plt.close(figure)
 
 

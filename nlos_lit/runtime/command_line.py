@@ -1,7 +1,8 @@
-"""What all commands share: errors as sentences, results that are not overwritten, the folder of a run."""
+"""What all commands share: errors as sentences, arguments, the folder that Hydra chose."""
 
 from __future__ import annotations
 
+import errno
 import functools
 import logging
 import re
@@ -9,18 +10,28 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from types import MappingProxyType
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
 
 from nlos_lit.capture.errors import UserError
+
+_FULL = "make room, or write elsewhere"
+_CLOSED = "change who may write there, or give another place"
+_NAMED = "move away what is there, or give another place"
+# What the disk may answer, and what to do.
+REFUSED = MappingProxyType(
+    {errno.ENOSPC: _FULL, errno.EDQUOT: _FULL, errno.EFBIG: _FULL}
+    | {errno.EROFS: _CLOSED, errno.EACCES: _CLOSED, errno.EPERM: _CLOSED}
+    | {errno.ENOTDIR: _NAMED, errno.EISDIR: _NAMED, errno.EEXIST: _NAMED, errno.ENAMETOOLONG: _NAMED}
+)
 
 
 def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
     """Print a :class:`~nlos_lit.capture.errors.UserError` as one sentence and exit with status 2.
 
-    Anything else keeps its traceback.
+    So is what the disk refuses. Ctrl-C is one word and status 130. Anything else keeps its traceback.
     """
 
     @functools.wraps(task)
@@ -30,42 +41,32 @@ def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             sys.exit(2)
+        except OSError as error:
+            advice = REFUSED.get(error.errno or 0)
+            if advice is None:
+                raise
+            where = error.filename or "a result"  # other libraries' writers do not say which
+            print(f"error: {where}: {error.strerror}; {advice}", file=sys.stderr)
+            sys.exit(2)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            sys.exit(130)
 
     return wrapped
 
 
-def refuse_finished_folder(arguments: list[str], diagnosis: bool = False) -> None:
-    """Exit with status 2, before anything is written, where ``hydra.run.dir`` holds a finished run.
-
-    It may where the run is resumed.
-
-    Args:
-        arguments: of the command line, ``key=value``.
-        diagnosis: a folder that holds a diagnosis is refused, too.
-    """
-    given = _given(arguments)
-    folder = given.get("hydra.run.dir")
-    if diagnosis and folder is not None and (Path(folder) / "diagnosis" / "diagnosis.json").exists():
-        print(f"error: {folder} already holds a diagnosis; choose another hydra.run.dir", file=sys.stderr)
-        sys.exit(2)
-    if folder is not None and (Path(folder) / "summary.json").exists() and "ckpt_path" not in given:
-        print(
-            f"error: {folder} already holds a finished run (summary.json); choose another hydra.run.dir, "
-            "or ckpt_path=last to go on from it",
-            file=sys.stderr,
-        )
-        sys.exit(2)
-
-
 def stay_in_run(arguments: list[str]) -> None:
-    """With ``run=FOLDER``, add arguments that keep log and config in it; exit where it is no run's folder."""
-    given = _given(arguments)
+    """With ``run=FOLDER``, add arguments that keep log and config in it.
+
+    Raises:
+        UserError: it is no run's folder.
+    """
+    given = given_values(arguments)
     if given.get("run", "null") == "null":
         return
-    folder = Path(given["run"].strip("'\""))
+    folder = Path(given["run"])
     if not (folder / "config.yaml").exists():
-        print(f"error: {folder} is not the folder of a finished run: config.yaml is missing", file=sys.stderr)
-        sys.exit(2)
+        raise UserError(f"{folder} is not the folder of a finished run: config.yaml is missing")
     if "hydra.run.dir" not in given:
         arguments += [f"hydra.run.dir='{folder}'", "hydra.output_subdir=diagnosis/.hydra"]
 
@@ -75,8 +76,15 @@ def output_folder() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def _given(arguments: list[str]) -> dict[str, str]:
-    return dict(item.split("=", 1) for item in arguments if "=" in item)
+def given_values(arguments: list[str]) -> dict[str, str]:
+    """``key=value`` arguments by key, without quotes around the value.
+
+    Examples:
+        >>> given_values(["-m", "seed=1,2", "hydra.run.dir='my run'"])
+        {'seed': '1,2', 'hydra.run.dir': 'my run'}
+    """
+    pairs = (item.split("=", 1) for item in arguments if "=" in item)
+    return {key: value.strip("'\"") for key, value in pairs}
 
 
 def quote_numbers(arguments: list[str]) -> None:
@@ -90,22 +98,6 @@ def quote_numbers(arguments: list[str]) -> None:
     """
     for index, argument in enumerate(arguments):
         arguments[index] = re.sub(r"^(scene)=(\d+)$", r"\1='\2'", argument)
-
-
-def write_config(config: DictConfig, folder: Path) -> dict[str, Any]:
-    """Resolve the config and keep it as ``config.yaml`` in the run's folder.
-
-    Args:
-        config: as Hydra composed it.
-        folder: of the run; made where it is not there.
-
-    Returns:
-        The config as plain containers.
-    """
-    resolved = cast(dict[str, Any], OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(resolved)))
-    return resolved
 
 
 def quiet_libraries() -> None:

@@ -1,9 +1,10 @@
-"""Memory: how much there is, how much a run may take, how much it will take."""
+"""Memory and disk: how much there is, how much a run may take, how much it will take."""
 
 from __future__ import annotations
 
 import re
 import resource
+import shutil
 import sys
 from pathlib import Path
 
@@ -53,6 +54,26 @@ def check_machine(needed: int, what: str, smaller: str = SMALLER) -> None:
         raise MemoryBudgetError(
             f"{what} needs about {needed / 2**30:.1f} GiB, this machine has {free / 2**30:.1f} GiB free; "
             + smaller
+        )
+
+
+def check_disk(folder: Path, needed: int, what: str) -> None:
+    """Refuse what the disk cannot hold.
+
+    Args:
+        folder: to be written to; it need not be there yet.
+        needed: bytes.
+        what: takes them.
+
+    Raises:
+        UserError: more than is free now.
+    """
+    there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise UserError(
+            f"{what} takes about {needed / 2**20:.0f} MiB, {there} has {free / 2**20:.0f} MiB free; "
+            "make room, or write elsewhere"
         )
 
 

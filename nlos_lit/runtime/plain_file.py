@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,8 +88,14 @@ def write_plain(
     np.savez(whole, tree=np.frombuffer(tree, np.uint8), **arrays)  # type: ignore[arg-type]  # arrays, not flags
     file.parent.mkdir(parents=True, exist_ok=True)
     part = file.with_suffix(".part")
-    part.write_bytes(whole.getvalue())
-    part.rename(file)
+    try:
+        with part.open("wb") as written:
+            written.write(whole.getbuffer())
+            written.flush()
+            os.fsync(written.fileno())
+        part.rename(file)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def read_plain(file: Path, kinds: Sequence[Kind] = (), shared: Mapping[str, Any] = NO_OBJECTS) -> Any:

@@ -55,7 +55,7 @@ class Steps:
         self.report, self.folder, self.settings = report, folder, settings
         self.know(kinds)
         made_with = None if folder is None else folder / SETTINGS
-        if made_with is not None and made_with.exists() and made_with.read_text() != settings:
+        if made_with is not None and made_with.is_file() and made_with.read_text() != settings:
             raise UserError(
                 f"{folder} holds the steps of an interrupted diagnosis with other settings; go on with the "
                 "same settings, choose another folder, or move it away"
@@ -131,7 +131,7 @@ class Steps:
             UserError: the file that was kept is damaged or foreign.
         """
         file = None if self.folder is None else self.folder / f"{name}.npz"
-        if file is not None and file.exists():
+        if file is not None and file.is_file():
             self.ahead[kind] = max(0, self.ahead[kind] - 1)
             kept = read_plain(file, self.kinds, self.shared)
             if not isinstance(kept, Kept):

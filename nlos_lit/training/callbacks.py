@@ -8,8 +8,10 @@ from typing import Any, cast
 
 import lightning as L
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins import TorchCheckpointIO
 
 from data_modules.spots import CaptureDataModule
+from nlos_lit.io.tensors import write_tensors
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import Ticker
 from nlos_lit.training.capture_fit import CaptureFit
@@ -18,6 +20,23 @@ from nlos_lit.training.shown import shown_spots
 
 def _data(trainer: L.Trainer) -> CaptureDataModule:
     return cast(CaptureDataModule, trainer.datamodule)  # type: ignore[attr-defined]  # set by trainer.fit
+
+
+class WholeCheckpoints(TorchCheckpointIO):
+    """Checkpoints written beside their target and renamed; Lightning's pass through the temporary folder.
+
+    Where that lies on another disk, a full one leaves half a checkpoint under the name of a whole one.
+    """
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write a checkpoint.
+
+        Args:
+            checkpoint: what is kept.
+            path: the target, written whole or not at all.
+            storage_options: not looked at.
+        """
+        write_tensors(path, checkpoint)
 
 
 class ScoreHeldout(L.Callback):
@@ -37,6 +56,15 @@ class ScoreHeldout(L.Callback):
         if not module.scores:
             module.scores = {"initial": module.all_scores(_data(trainer))}
 
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """There is something to fit: earlier final scores are none any more.
+
+        Args:
+            trainer: not looked at.
+            module: loses ``scores["final"]``.
+        """
+        cast(CaptureFit, module).scores.pop("final", None)
+
     def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Score what was fitted.
 
@@ -46,6 +74,16 @@ class ScoreHeldout(L.Callback):
         """
         module = cast(CaptureFit, module)
         module.scores["final"] = module.all_scores(_data(trainer))
+
+    def on_fit_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Score what was fitted where nothing was left to fit: the run was stopped after its last iteration.
+
+        Args:
+            trainer: its data module holds the spots.
+            module: as in :meth:`on_train_end`.
+        """
+        if "final" not in cast(CaptureFit, module).scores:
+            self.on_train_end(trainer, module)
 
 
 class History(L.Callback):

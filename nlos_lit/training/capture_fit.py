@@ -30,6 +30,7 @@ class CaptureFit(L.LightningModule):
     Attributes:
         what: one batch is called, in the plural.
         scores: ``initial`` and ``final``, set by :class:`~nlos_lit.training.callbacks.ScoreHeldout`.
+        origin: what is fitted and how, see :func:`~nlos_lit.training.origin.origin_of`; checkpoints keep it.
     """
 
     what = "iterations"
@@ -38,6 +39,7 @@ class CaptureFit(L.LightningModule):
         super().__init__()
         self.scale = scale
         self.scores: dict[str, dict[str, float]] = {}
+        self.origin: dict[str, Any] = {}
 
     @property
     @abstractmethod
@@ -118,8 +120,8 @@ class CaptureFit(L.LightningModule):
         return self._finish_score()
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the scores."""
-        checkpoint["scores"] = self.scores
+        """Keep the scores, and what they are of."""
+        checkpoint["scores"], checkpoint["origin"] = self.scores, self.origin
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take them back."""

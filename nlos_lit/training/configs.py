@@ -14,14 +14,17 @@ from typing import Any, TypeVar, cast
 
 import hydra
 import lightning as L
+import yaml
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
+from nlos_lit.training.folder import register_names
 from nlos_lit.training.instantiate import arguments_of
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -30,12 +33,15 @@ SETTINGS: dict[str, type] = {
     "surfels": SurfelSettings,
     "criticism": CriticismSettings,
 }
+LARGEST_CONFIG = 2**19  # bytes of a run's config.yaml
+DEEPEST_CONFIG = 32  # lists and mappings in each other
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
 T = TypeVar("T")
 
 
 def register_settings() -> None:
-    """Make the groups ``schema/…`` known to Hydra; to be called before a config is composed."""
+    """Make the groups ``schema/…`` and ``${file_name:…}`` known; to be called before a config is composed."""
+    register_names()
     store = ConfigStore.instance()
     for name, kind in SETTINGS.items():
         node = OmegaConf.structured(kind)
@@ -87,6 +93,27 @@ def settings_of(kind: Callable[..., T], values: Mapping[str, Any], where: str, *
         raise UserError(f"{where} is incomplete: {error}") from error
 
 
+def _plain_yaml(file: Path) -> dict[str, Any]:
+    """A config that a run has written; the file may come from anywhere, and be made to take all memory."""
+    foreign = UserError(f"{file} is damaged, or not written by this program")
+    if file.stat().st_size > LARGEST_CONFIG:
+        raise foreign
+    text = file.read_text(encoding="utf-8", errors="replace")
+    try:
+        depth = 0
+        for event in yaml.parse(text, yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            # An alias names what stands elsewhere: a few lines of them may stand for billions.
+            if isinstance(event, yaml.AliasEvent) or depth > DEEPEST_CONFIG:
+                raise foreign
+        config = OmegaConf.to_container(OmegaConf.create(text))
+    except (yaml.YAMLError, OmegaConfBaseException, RecursionError, ValueError) as error:
+        raise foreign from error
+    if not isinstance(config, dict):
+        raise foreign
+    return cast(dict[str, Any], config)
+
+
 def run_config(folder: str | Path) -> dict[str, Any]:
     """The resolved config that a run left in its folder.
 
@@ -100,9 +127,9 @@ def run_config(folder: str | Path) -> dict[str, Any]:
         UserError: the folder is not a run's, or another version of the project wrote it.
     """
     file = Path(folder) / "config.yaml"
-    if not file.exists():
+    if not file.is_file():
         raise UserError(f"{folder} is not the folder of a finished run: {file.name} is missing")
-    config = cast(dict[str, Any], OmegaConf.to_container(OmegaConf.load(file)))
+    config = _plain_yaml(file)
     missing = {"scene", "model", "objective", "optimizer", "surfels", "export"} - set(config)
     unread = {
         f"{name}.{key}"

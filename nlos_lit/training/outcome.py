@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.io.files import write_json
 from nlos_lit.io.meshes import write_mesh
@@ -72,9 +74,13 @@ def write_results(
 
     Returns:
         The summary.
+
+    Raises:
+        UserError: the fit ended in NaN or infinite scores or voxels.
     """
     module, capture, config = run.module, run.capture, run.config
     pipeline = module.pipeline
+    heldout = heldout_scores(module.scores["initial"], module.scores["final"], capture)
     with torch.no_grad():
         volume = pipeline.phasor()
         albedo = pipeline.albedo(volume)
@@ -113,8 +119,7 @@ def write_results(
         scene=config["scene"]["name"],
         seed=config["seed"],
         loss=(first["loss"], last["loss"]),
-        nmse=(first["nmse"], last["nmse"], last["nmse_noise_floor"]),
-        deviance_per_bin=(first["deviance_per_bin"], last["deviance_per_bin"], last["deviance_noise"]),
+        **heldout,
         parameters={name: (entry["value"], entry["unit"]) for name, entry in parameters.items()},
         seconds=(
             run.setup_seconds,
@@ -166,8 +171,7 @@ def write_surface_summary(
         scene=config["scene"]["name"],
         seed=config["seed"],
         loss=(first["loss"], last["loss"]),
-        nmse=(first["nmse"], last["nmse"], last["nmse_noise_floor"]),
-        deviance_per_bin=(first["deviance_per_bin"], last["deviance_per_bin"], last["deviance_noise"]),
+        **heldout_scores(first, last, run.capture),
         parameters={name: (q["value"], q["unit"]) for name, q in module.imaging_parameters().items()},
         seconds=(run.setup_seconds, per_batch, total_seconds),
         geometry=refined["geometry"],
@@ -183,6 +187,37 @@ def write_surface_summary(
     )
     write_json(folder / "summary.json", summary)
     return summary
+
+
+def heldout_scores(
+    first: dict[str, float], last: dict[str, float], capture: Capture
+) -> dict[str, tuple[float, float, float]]:
+    """Scores of the held-out spots before and after a fit, and what counting noise would give.
+
+    Args:
+        first: before the first iteration, as :meth:`~nlos_lit.training.capture_fit.CaptureFit.all_scores`.
+        last: after the last one.
+        capture: that was fitted; expected values have no counting noise, it is NaN.
+
+    Returns:
+        ``nmse`` and ``deviance_per_bin``, three numbers each.
+
+    Raises:
+        UserError: a score after the fit is NaN or infinite.
+    """
+    broken = [name for name, value in last.items() if not math.isfinite(value)]
+    if broken:
+        raise UserError(
+            f"the fit has left the numbers ({', '.join(broken)} NaN or infinite), which is no result: lower "
+            "optimizer.rates, or look for damaged values in the capture"
+        )
+    noisy = 1.0 if capture.is_counts else math.nan
+    return {
+        "nmse": (first["nmse"], last["nmse"], noisy * last["nmse_noise_floor"]),
+        "deviance_per_bin": (
+            first["deviance_per_bin"], last["deviance_per_bin"], noisy * last["deviance_noise"],
+        ),
+    }  # fmt: skip
 
 
 def _capture_entry(capture: Capture) -> dict[str, Any]:

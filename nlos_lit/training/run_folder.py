@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,12 +29,14 @@ from nlos_lit.model.phasor import PhasorPlan
 from nlos_lit.runtime.memory import SMALLER, check_machine, parse_bytes, resident_bytes
 from nlos_lit.runtime.progress import planes_progress
 from nlos_lit.training.configs import run_config, settings_of
+from nlos_lit.training.folder import OVERRIDES, begun_from
 from nlos_lit.training.instantiate import builder
+from nlos_lit.training.origin import IMAGE, check_origin, finished_checkpoint, origin_of, read_checkpoint
 from nlos_lit.training.self_calibration import SelfCalibration
 
 log = logging.getLogger(__name__)
 
-NOT_OF_THE_CAPTURE = ("iterations", "threshold", "wavelength")  # settings of a scene
+NO_CHECKPOINTS: Mapping[Path, Sequence[str]] = MappingProxyType({})
 LATER_LIBRARIES = 100 * 2**20  # what logging, figures and export load after the estimate
 
 
@@ -50,6 +53,7 @@ class Run:
         setup_seconds: from the config to the first iteration.
         estimated_bytes: largest memory the run is expected to take.
         extension: effects, at their nulls, that are fitted with the surfels.
+        origin: what the fit comes from, see :func:`~nlos_lit.training.origin.origin_of`.
     """
 
     config: dict[str, Any]
@@ -60,6 +64,7 @@ class Run:
     setup_seconds: float
     estimated_bytes: int
     extension: Extension
+    origin: dict[str, Any]
 
 
 def field_shards(config: Mapping[str, Any]) -> int:
@@ -79,7 +84,12 @@ def field_shards(config: Mapping[str, Any]) -> int:
     return devices
 
 
-def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", shards: int = 1) -> Run:
+def prepare_run(
+    config: Mapping[str, Any],
+    device: torch.device | str = "cpu",
+    shards: int = 1,
+    opens: Mapping[Path, Sequence[str]] = NO_CHECKPOINTS,
+) -> Run:
     """Everything before the first iteration: capture, volume, memory, propagated phasor field, start values.
 
     Args:
@@ -87,16 +97,21 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
         device: where the phasor field and the parameters are put.
         shards: processes that share the field; where there are several, it and the start values are made when
             the fit begins.
+        opens: checkpoints that the run is to go on from → sections of settings that they must share.
 
     Returns:
         The run, ready to fit.
 
     Raises:
-        UserError: the data, the geometry or the settings cannot work; nothing has been written then.
+        UserError: the data, the geometry or the settings cannot work, or a checkpoint is of something else;
+            nothing has been written then.
     """
     began = time.perf_counter()
     scene, seed = config["scene"], int(config["seed"])
     capture, truth = load_scene(scene, config["data_dir"], seed)
+    origin = origin_of(config, capture)
+    for file, sections in opens.items():
+        check_origin(file, origin, sections)
     effects = config["effects"]
     extension = Extension(build_effects([effects] if isinstance(effects, str) else effects, Scan.of(capture)))
     grid = volume_grid(capture, **scene["volume"])
@@ -146,7 +161,9 @@ def prepare_run(config: Mapping[str, Any], device: torch.device | str = "cpu", s
         rates=config["optimizer"]["rates"],
         prepare=prepare_shared if shards > 1 else None,
     )
-    run = Run(dict(config), capture, truth, data, module, time.perf_counter() - began, estimated, extension)
+    module.origin = origin
+    seconds = time.perf_counter() - began
+    run = Run(dict(config), capture, truth, data, module, seconds, estimated, extension, origin)
     return run
 
 
@@ -160,15 +177,11 @@ def open_run(folder: str | Path) -> Run:
         The run, on the CPU, its parameters as fitted.
 
     Raises:
-        UserError: the folder is not a run's, has no checkpoint, or is of another version.
+        UserError: the folder is not a run's, the run was not carried through, is of another version, or of
+            what its capture's file held before.
     """
-    folder = Path(folder)
-    config, checkpoint = run_config(folder), folder / "checkpoints" / "last.ckpt"
-    if not checkpoint.exists():
-        raise UserError(
-            f"{folder} is not the folder of a finished run: {checkpoint.relative_to(folder)} is missing"
-        )
-    run = prepare_run(config)
+    config, checkpoint = run_config(folder), finished_checkpoint(Path(folder))
+    run = prepare_run(config, opens={checkpoint: IMAGE})
     load_fitted(run, checkpoint)
     return run
 
@@ -180,38 +193,9 @@ def load_fitted(run: Run, checkpoint: Path) -> None:
         run: with the settings of the fitted one; changed in place.
         checkpoint: of the fitted run.
     """
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    state = read_checkpoint(checkpoint)
     run.module.load_state_dict(state["state_dict"])
     run.module.scores = state["scores"]
-
-
-def fitted_of(folder: Path, settings: Mapping[str, Any]) -> Path:
-    """The checkpoint of a finished run whose image other settings are to start from.
-
-    Args:
-        folder: of the run.
-        settings: resolved; they must be of the same capture and held-out spots.
-
-    Returns:
-        The file.
-
-    Raises:
-        UserError: it is the folder of no finished run, or of one with another capture or held-out spots.
-    """
-    theirs, checkpoint = run_config(folder), folder / "checkpoints" / "last.ckpt"
-    if not checkpoint.exists():
-        raise UserError(
-            f"{folder} is the folder of no finished self-calibration: checkpoints/last.ckpt is missing"
-        )
-    kept = [f"scene.{key}" for key in settings["scene"] if key not in NOT_OF_THE_CAPTURE]
-    for key in [*kept, *(f"heldout.{key}" for key in settings["heldout"]), "seed"]:
-        section, _, name = key.partition(".")
-        mine, other = (s[section][name] if name else s[section] for s in (settings, theirs))
-        if mine != other:
-            raise UserError(
-                f"run={folder} was made with {key}={other}, this command has {mine}; give the same"
-            )
-    return checkpoint
 
 
 def find_checkpoint(
@@ -220,13 +204,15 @@ def find_checkpoint(
     """The checkpoint file to go on from.
 
     Args:
-        ckpt_path: a file, or ``last``: that of ``folder``, else of the newest run beside it; None for none.
+        ckpt_path: a file, or ``last``: that of ``folder`` where a run was begun there, else of the newest run
+            beside it; None for none.
         folder: of the run that is about to begin.
         scene: its scene's name, for the error message.
         place: where in a run's folder its checkpoints are.
 
     Returns:
-        The file; None where nothing is resumed.
+        The file; None where nothing is resumed. A run that was stopped before its own first one begins again
+        from what it was begun from.
 
     Raises:
         UserError: there is none.
@@ -240,6 +226,9 @@ def find_checkpoint(
     own = folder / place / "last.ckpt"
     if own.exists():
         return own
+    if (folder / OVERRIDES).exists():
+        log.info("%s holds no checkpoint yet: the run begins again", folder)
+        return begun_from(folder)
     others = sorted(folder.parent.glob(f"*/{place}/last.ckpt"), key=lambda path: path.stat().st_mtime)
     if not others:
         raise UserError(
@@ -248,6 +237,7 @@ def find_checkpoint(
     return others[-1]
 
 
+_PICTURES = 20 * 2**20  # figures as files and in TensorBoard, points, mesh
 _SCRATCH = 100 * 2**20  # runs of samples that are worked on at once
 
 
@@ -269,3 +259,17 @@ def run_bytes(plan: PhasorPlan, n_voxels: int, rays: int) -> int:
     iterating = 72 * n_voxels + 120 * rays
     matching = 24 * n_voxels + 180 * rays
     return max(plan.total_bytes, plan.resident_bytes + max(iterating, matching) + _SCRATCH)
+
+
+def run_disk_bytes(n_voxels: int) -> int:
+    """What a run writes: three checkpoints (one while it replaces another), volume and albedo, pictures.
+
+    A checkpoint holds three numbers a voxel: its albedo and Adam's two moments.
+
+    Args:
+        n_voxels: of the volume.
+
+    Returns:
+        Bytes.
+    """
+    return (3 * 12 + 8) * n_voxels + _PICTURES

@@ -18,9 +18,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.strengths import report
-from nlos_lit.io.files import whole_file
 from nlos_lit.io.meshes import write_mesh
 from nlos_lit.io.points import write_points
+from nlos_lit.io.tensors import write_tensors
 from nlos_lit.metrics.excess import Excess, excess_by_axis
 from nlos_lit.model.build import normalisation
 from nlos_lit.model.laser_sensor import LaserSensor
@@ -74,7 +74,9 @@ def prepare_surface(run: Run, laser_sensor: LaserSensor | None = None) -> Surfac
     log.info("%d surfels at the maxima of the image; %d batches and more", len(fit.model), fit.ahead)
     grid = phasor.grid
     image = FrontImage(intensity.amax(0).numpy(), grid.x, grid.y)
-    return SurfaceFitting(fit, normalisation(run.capture), image)
+    module = SurfaceFitting(fit, normalisation(run.capture), image)
+    module.origin = run.origin
+    return module
 
 
 def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -> dict[str, Any]:
@@ -95,11 +97,9 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
     points = found.points()
     write_points(place / "points.ply", points)
     mesh = write_mesh(place / "mesh.ply", points, depth=export["mesh_depth"])
-    with whole_file(place / "surfels.pt") as temporary:
-        torch.save(found.model.state_dict(), temporary)
-    with whole_file(place / "effects.pt") as temporary:
-        names = [effect.name for effect in found.extension.effects]
-        torch.save({"names": names, "state": found.extension.state_dict()}, temporary)
+    write_tensors(place / "surfels.pt", found.model.state_dict())
+    names = [effect.name for effect in found.extension.effects]
+    write_tensors(place / "effects.pt", {"names": names, "state": found.extension.state_dict()})
     spots = shown_spots(capture.n_spots, export["transients"])
     shown = {
         "transients": transients_of(capture, spots, found.expected(torch.from_numpy(spots))),
@@ -196,7 +196,7 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
     """
     place = Path(folder) / "refined"
     for name in ("surfels.pt", "effects.pt"):
-        if not (place / name).exists():
+        if not (place / name).is_file():
             raise UserError(
                 f"{folder} holds no refined surfels: refined/{name} is missing; "
                 "run train.py with refine=true, effects=[…] or model=surface"

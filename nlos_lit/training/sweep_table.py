@@ -1,30 +1,40 @@
-"""One table of a multirun: a row a job, as CSV and Markdown."""
+"""Runs side by side: the settings in which they differ, their errors, and the spread over seeds."""
 
 from __future__ import annotations
 
 import json
 import logging
+import math
+import statistics
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from nlos_lit.capture.errors import UserError
+from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table, write_csv
 
 log = logging.getLogger(__name__)
 
-COLUMNS = {
-    "scene": ("scene",),
-    "ablation": ("ablation",),
-    "seed": ("seed",),
+ERRORS = {
     "MSE transient (held out)": ("transient_mse", "heldout", "final"),
     "MSE transient (train)": ("transient_mse", "train", "final"),
     "NMSE": ("heldout", "nmse", "final"),
     "NMSE noise": ("heldout", "nmse", "noise_floor"),
     "deviance/bin": ("heldout", "deviance_per_bin", "final"),
+    "depth, median (m)": ("geometry", "depth_median_abs"),
+    "normals, median (°)": ("geometry", "normal_median_deg"),
+    "coverage": ("geometry", "coverage"),
     "s/iteration": ("seconds", "per_iteration"),
 }
+# Sections of a config that say where and how a run is kept, or repeat what a name says.
+NOT_SETTINGS = ("folder", "callbacks", "logger", "trainer.default_root_dir", "ablation.optimise", "ckpt_path")
+ALONE = {"scene.name": "scene", "ablation.name": "ablation", "method.name": "method"}
+SEEDS = "seeds"
 
 
 class SweepTable(Callback):
@@ -33,37 +43,140 @@ class SweepTable(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Write the table of all jobs that left a summary."""
         folder = Path(config.hydra.sweep.dir)
-        rows = sweep_rows(folder)
+        rows = run_rows(sorted(path.parent for path in folder.glob("*/summary.json")))
         if rows:
             write_table(folder, rows)
             log.info("the sweep's table is %s", folder / "table.md")
 
 
-def sweep_rows(folder: Path) -> list[dict[str, Any]]:
-    """A row per ``*/summary.json`` below ``folder``, best held-out error last, as in the paper's Table 1."""
-    rows = []
-    for path in sorted(folder.glob("*/summary.json")):
-        summary = json.loads(path.read_text())
-        row: dict[str, Any] = {}
-        for column, keys in COLUMNS.items():
-            value: Any = summary
-            for key in keys:
-                value = value[key]
-            row[column] = value
-        rows.append(row)
-    return sorted(rows, key=lambda row: -row["MSE transient (held out)"])
+def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
+    """A row a run: where it differs from the others, and its errors; the best last, as in Table 1.
+
+    Errors that no run has (geometry without a truth) are left out.
+
+    Args:
+        folders: of finished runs.
+
+    Returns:
+        column → value; settings come first.
+
+    Raises:
+        UserError: a folder holds no finished run.
+    """
+    read = [_read(folder) for folder in folders]
+    settings = differing([dict(_settings(config)) for config, _ in read])
+    errors = [{column: _at(summary, keys) for column, keys in ERRORS.items()} for _, summary in read]
+    known = [column for column in ERRORS if any(error[column] is not None for error in errors)]
+    rows = [
+        {**setting, **{column: error[column] for column in known}}
+        for setting, error in zip(settings, errors, strict=True)
+    ]
+    order = [error["MSE transient (held out)"] or error["NMSE"] or math.inf for error in errors]
+    return [row for _, row in sorted(zip(order, rows, strict=True), key=lambda pair: -pair[0])]
 
 
-def write_table(folder: Path, rows: list[dict[str, Any]]) -> None:
-    """``table.csv`` and ``table.md``, four digits a number.
+def differing(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Of each of some sets of settings, those that are not alike in all; of several that differ alike one.
+
+    Examples:
+        >>> differing([{"a": 1, "b": 2, "c": 5, "d": 2}, {"a": 1, "b": 3, "c": 6, "d": 3}])
+        [{'b': 2, 'c': 5}, {'b': 3, 'c': 6}]
+    """
+    keys = list(dict.fromkeys(key for each in settings for key in each))
+    values = {key: [repr(each.get(key)) for each in settings] for key in keys}
+    told: dict[str, list[str]] = {}
+    for key in keys:
+        if len(set(values[key])) > 1 and values[key] not in told.values():
+            told[key] = values[key]
+    return [{key: each.get(key) for key in told} for each in settings]
+
+
+def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Rows that differ in the seed alone, as one: mean and sample standard deviation of each error.
+
+    Args:
+        rows: of :func:`run_rows`.
+
+    Returns:
+        column → value, with the number of seeds; empty where no setting was run with two.
+    """
+    groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        named = {key: row[key] for key in row if key not in ERRORS and key != "seed"}
+        groups.setdefault(tuple((key, repr(value)) for key, value in named.items()), []).append(row)
+    if max((len(group) for group in groups.values()), default=0) < 2:
+        return []
+    told = []
+    for group in groups.values():
+        row = {key: value for key, value in group[0].items() if key not in ERRORS and key != "seed"}
+        row[SEEDS] = len(group)
+        for column in (column for column in ERRORS if column in group[0]):
+            values = [each[column] for each in group if each[column] is not None]
+            row[column] = statistics.fmean(values) if values else None
+            row[f"{column} ±"] = statistics.stdev(values) if len(values) > 1 else None
+        told.append(row)
+    return told
+
+
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """All runs as Markdown, and below them the spread over seeds where there is one; four digits a number."""
+    spread = over_seeds(rows)
+    for row in spread:
+        for column in [column for column in ERRORS if column in row]:
+            mean, deviation = row.pop(column), row.pop(f"{column} ±")
+            row[column] = _show(mean) + (f" ± {deviation:.2g}" if deviation is not None else "")
+    tables = [markdown_table([dict(row) for row in rows], _show)]
+    if spread:
+        tables.append("Mean and standard deviation over seeds:\n\n" + markdown_table(spread, _show))
+    return "\n\n".join(tables)
+
+
+def write_table(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """``table.csv``, ``table.md``, and ``seeds.csv`` where settings were run with several seeds.
 
     Args:
         folder: where to.
-        rows: column → value.
+        rows: of :func:`run_rows`.
     """
-    write_csv(folder / "table.csv", rows)
+    write_csv(folder / "table.csv", [dict(row) for row in rows])
+    spread = over_seeds(rows)
+    if spread:
+        write_csv(folder / "seeds.csv", spread)
+    with whole_file(folder / "table.md") as partial:
+        partial.write_text(table(rows) + "\n", encoding="utf-8")
 
-    def cell(value: Any) -> str:
-        return f"{value:.4g}" if isinstance(value, float) else str(value)
 
-    (folder / "table.md").write_text(markdown_table(rows, cell) + "\n")
+def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Config and summary of a finished run."""
+    for name in ("config.yaml", "summary.json"):
+        if not (folder / name).is_file():
+            raise UserError(f"{folder} is not the folder of a finished run: {name} is missing")
+    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    return config, json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+
+
+def _settings(config: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted key → value of what was set, the scene's and the ablation's names by their groups' names."""
+    for name, value in config.items():
+        key = f"{above}{name}"
+        if f"{key}.".startswith(tuple(f"{section}." for section in NOT_SETTINGS)):
+            continue
+        if isinstance(value, dict):
+            yield from _settings(value, f"{key}.")
+        else:
+            yield ALONE.get(key, key), value
+
+
+def _at(summary: Any, keys: Iterable[str]) -> Any:
+    """What a summary holds below some keys; None where it does not, or no number."""
+    for key in keys:
+        if not isinstance(summary, dict) or key not in summary:
+            return None
+        summary = summary[key]
+    return summary
+
+
+def _show(value: Any) -> str:
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value).replace("|", "\\|")

@@ -52,4 +52,4 @@ def test_what_cannot_work_is_one_sentence(overrides, sentence, tmp_path):
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert sentence in done.stderr.strip().splitlines()[-1]
-    assert not (tmp_path / "bad" / "volume.h5").exists()
+    assert not (tmp_path / "bad").exists()

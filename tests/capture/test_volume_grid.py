@@ -9,7 +9,7 @@ import pytest
 from small_capture import fields, grid_points
 
 from nlos_lit.capture import Capture
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import CaptureError, UserError
 from nlos_lit.capture.volume_grid import VolumeGrid, path_range, volume_grid
 
 
@@ -63,3 +63,12 @@ def test_path_range_bounds_every_path():
     near, far = path_range(capture, grid)
     assert near <= paths.min() < 1.5 * near
     assert paths.max() <= far < 1.5 * paths.max()
+
+
+def test_a_volume_that_holds_the_wall_is_refused():
+    """A wall tilted by 30° reaches into it, and light would take no time there."""
+    flat = fields()["laser"]
+    tilted = flat @ np.array([[0.866, 0.0, -0.5], [0.0, 1.0, 0.0], [0.5, 0.0, 0.866]])
+    capture = Capture(**fields(laser=tilted, sensor=tilted, t_start=0.0))
+    with pytest.raises(CaptureError, match=r"holds points of the wall, which lie at z = .* begin deeper"):
+        volume_grid(capture, depth=(0.02, 0.4))

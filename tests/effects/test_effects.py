@@ -136,5 +136,5 @@ def test_build_effects_follows_the_registry_and_refuses_unknown_names():
     ]
     assert names == ["time_offset", "afterpulsing", "pile_up"]
     assert build_effects([], scan) == []
-    with pytest.raises(UserError, match=r"'sun'.*choose from retroreflection, .*gate_edges"):
+    with pytest.raises(UserError, match=r"'sun'.*there are retroreflection, .*gate_edges"):
         build_effects(["sun", "pile_up"], scan)

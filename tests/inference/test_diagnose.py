@@ -161,9 +161,11 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
 def test_what_cannot_be_diagnosed_is_one_sentence(tmp_path):
     render = dataclasses.replace(capture_of(raster(16), counts=np.ones((256, 64))), is_counts=False)
     write_capture(tmp_path / "render.hdf5", render)
+    own = f"scene=capture scene.volume.depth=[0.4,0.9] scene.path={tmp_path / 'render.hdf5'}"
     bad = {
-        f"run={tmp_path / 'nowhere'}": "is not the folder of a finished run: config.yaml is missing",
-        f"scene=capture scene.path={tmp_path / 'render.hdf5'}": "holds expected values (a render)",
+        f"run={tmp_path / 'nowhere'}": "run must be a file or folder that is there",
+        f"run={tmp_path}": "is not the folder of a finished run: config.yaml is missing",
+        own: "holds expected values (a render)",
         "scene.simulate.scan.nx=6 scene.simulate.scan.ny=6": "needs a scan of at least 16 × 16 spots",
     }
     for overrides, words in bad.items():

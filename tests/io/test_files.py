@@ -56,6 +56,14 @@ def test_a_volume_of_another_shape_than_its_grid_is_refused(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_volume_with_a_nan_is_no_result(tmp_path):
+    volume = np.ones(GRID.shape)
+    volume[1, 1, 1] = np.nan
+    with pytest.raises(UserError, match="1 of 24 voxels of the albedo are NaN or infinite"):
+        write_volume(tmp_path / "v.h5", np.ones(GRID.shape), GRID, albedo=volume)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_reading_what_is_no_volume(tmp_path):
     (tmp_path / "text.h5").write_text("not HDF5")
     with h5py.File(tmp_path / "other.h5", "w") as file:

@@ -9,9 +9,12 @@ import threading
 import numpy as np
 import pytest
 from conftest import real_file
+from small_capture import fields
 
+from data_modules import load
 from data_modules.load import find_file, load_scene
 from data_modules.readers import write_capture
+from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.training.configs import compose
@@ -62,7 +65,27 @@ def test_a_file_in_the_data_folder_is_found(tmp_path):
         find_file(scene("diffuse_s"), tmp_path)
 
 
-def test_a_known_address_is_downloaded_and_its_checksum_checked(tmp_path):
+@pytest.mark.parametrize("largest", [1e38, 2e12, 1e-40])
+def test_values_that_no_sum_of_squares_holds_are_refused(tmp_path, largest):
+    counts = np.full((12, 10), 1e-3 * largest)
+    counts[0, 0] = largest
+    write_capture(tmp_path / "a.hdf5", Capture(**fields(counts=counts, is_counts=False)))
+    with pytest.raises(UserError, match=r"the capture's largest value is .*; what is computed of values"):
+        load_scene(scene("capture", f"scene.path={tmp_path}/a.hdf5"), tmp_path, seed=0)
+
+
+def test_a_foreign_config_downloads_nothing(tmp_path, monkeypatch):
+    def fetch(*_):
+        raise AssertionError("an address of a stranger was asked")
+
+    monkeypatch.setattr(load.pooch, "retrieve", fetch)
+    theirs = {"file": "../../.bashrc", "origin": "", "url": "http://127.0.0.1:1/x", "sha256": "0" * 64}
+    with pytest.raises(UserError, match=r"127\.0\.0\.1:1/x is no address of this project's own scenes"):
+        find_file(scene("su") | {"source": theirs}, tmp_path / "a" / "b")
+    assert scene("su")["source"] in load.shipped_sources()
+
+
+def test_a_known_address_is_downloaded_and_its_checksum_checked(tmp_path, monkeypatch):
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "capture.bin").write_bytes(b"photons")
 
@@ -78,6 +101,7 @@ def test_a_known_address_is_downloaded_and_its_checksum_checked(tmp_path):
         url = f"http://127.0.0.1:{server.server_port}/capture.bin"
         known = scene("su") | {"source": {"file": "got.bin", "origin": "here", "url": url, "sha256": None}}
         known["source"]["sha256"] = hashlib.sha256(b"photons").hexdigest()
+        monkeypatch.setattr(load, "shipped_sources", lambda: [known["source"]])
         assert find_file(known, tmp_path / "data").read_bytes() == b"photons"
         known["source"] |= {"file": "other.bin", "sha256": hashlib.sha256(b"electrons").hexdigest()}
         with pytest.raises(UserError, match=r"could not download .* put it at .*other.bin"):

@@ -1,5 +1,6 @@
 """The MATLAB v5 reader against SciPy's writer, and the page on one's own data against the readers."""
 
+import os
 import re
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from data_modules.readers import read_capture
+from data_modules.readers import mat5, read_capture
 from data_modules.readers.contents import open_contents
 from nlos_lit.capture.errors import CaptureError
 
@@ -80,3 +81,20 @@ def test_the_page_on_own_data_works(tmp_path, monkeypatch):
         np.testing.assert_allclose(capture.laser[5 * 32 + 7, :2], (names["x"][5], names["y"][7]), rtol=1e-12)
         assert capture.bin_width_ps == pytest.approx(16.0)
     assert (plain.is_counts, own.is_counts, own.gate, own.exposure_s) == (True, True, (150, 512), 0.1)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_file_that_is_cut_while_it_is_read_is_one_sentence(tmp_path, monkeypatch, packed):
+    """Mapped into memory it would end the process."""
+    path, peek = tmp_path / "a.mat", mat5._peek
+    values = np.random.default_rng(0).random((300, 300))
+    scipy.io.savemat(path, {"rect_data": values}, do_compression=packed)
+    contents = open_contents(path)
+
+    def cut(*given):
+        os.truncate(path, 4096)
+        return peek(*given)
+
+    monkeypatch.setattr(mat5, "_peek", cut)
+    with pytest.raises(CaptureError, match="cut short while it was read"):
+        contents.read("rect_data")

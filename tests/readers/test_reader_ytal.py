@@ -194,14 +194,46 @@ def test_altered_facts_are_refused(tmp_path, edit):
         read_capture(files.ytal(tmp_path, scene_info=f"nlos_lit: {edit}\n"))
 
 
-def test_altered_types_cannot_ask_for_objects(tmp_path):
-    path = write_capture(tmp_path / "a.hdf5", _capture("confocal"))
+def altered(path, values=None, **changes) -> None:
+    """Other facts, and other values of the first spot's first bins, in a file that we wrote."""
     with h5py.File(path, "r+") as file:
         facts = json.loads(file["scene_info"][()].decode().removeprefix("nlos_lit: "))
         del file["scene_info"]
-        file["scene_info"] = "nlos_lit: " + json.dumps({**facts, "dtype": "object"})
-    with pytest.raises(CaptureError, match="scene_info"):
+        file["scene_info"] = "nlos_lit: " + json.dumps({**facts, **changes})
+        if values is not None:
+            file["H"][: len(values), 0, 0] = values
+
+
+@pytest.mark.parametrize(
+    ("values", "changes", "sentence"),
+    [
+        (None, {"dtype": "object"}, "scene_info"),
+        ([300], {"dtype": "uint8"}, "holds 0 to 300, which uint8 does not hold"),
+        ([-1], {"dtype": "uint32"}, "holds -1 to .*, which uint32 does not hold"),
+        ([2.0**64], {"dtype": "uint64"}, "which uint64 does not hold"),
+        ([1e6], {"dtype": "float16"}, "which float16 does not hold"),
+        ([0.3], {}, "which uint16 does not hold"),
+        ([0.3], {"dtype": "float32"}, "no whole numbers where scene_info says photon counts"),
+        (None, {"is_counts": 0.3}, "scene_info"),
+        (None, {"exposure_s": float("nan")}, "exposure_s must be a positive number of seconds; found nan"),
+        (None, {"exposure_s": -2}, "exposure_s must be a positive number of seconds; found -2"),
+        (None, {"scan_shape": [2, 3]}, r"spots \(3, 2\) where scan_shape \(2, 3\)"),
+        (None, {"scan_shape": None}, r"spots \(3, 2\) where scan_shape None"),
+        (None, {"gate": [2, 18]}, "gate"),
+        (None, {"scan_order": [0, 0, 1, 2, 3, 4]}, "scan_order must be a permutation"),
+    ],
+)
+def test_facts_that_the_arrays_contradict_are_refused(tmp_path, values, changes, sentence):
+    path = write_capture(tmp_path / "a.hdf5", _capture("confocal"))
+    altered(path, values, **changes)
+    with pytest.raises(CaptureError, match=sentence):
         read_capture(path)
+
+
+def test_values_that_are_no_whole_numbers_are_not_written_as_counts(tmp_path):
+    capture = _capture("confocal")
+    with pytest.raises(CaptureError, match="whole numbers"):
+        write_capture(tmp_path / "a.hdf5", capture.with_counts(capture.counts / 2))
 
 
 def test_first_and_last_way_are_taken_off_by_whole_bins(tmp_path):

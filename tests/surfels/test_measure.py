@@ -145,7 +145,7 @@ def test_one_amplitude_given_leaves_the_others_at_their_null(scan):
 @pytest.mark.parametrize(
     ("names", "values", "words"),
     [
-        (["pileup"], {}, "no effect 'pileup'; choose from retroreflection, .*gate_edges"),
+        (["pileup"], {}, "no effect 'pileup'; did you mean pile_up"),
         (["pile_up"], {"irf_tail.fraction": 0.1}, "irf_tail is not among"),
         (
             ["pile_up"],

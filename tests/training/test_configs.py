@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import inspect
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,8 +26,11 @@ from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.commands.train import make_trainer
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.model.objective import Objective
+from nlos_lit.runtime.arguments import check_config
+from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
+from nlos_lit.training.folder import file_name
 
 
 def names(group: str) -> list[str]:
@@ -49,13 +55,21 @@ def test_every_group_is_looked_at():
     assert {path.name for path in CONF.iterdir() if path.is_dir()} == {"hydra"}.union(*GROUPS.values())
 
 
-@pytest.mark.parametrize(
-    ("command", "group", "name"),
-    [(c, g, n) for c, groups in GROUPS.items() for g in groups for n in names(g)],
-)
-def test_every_config_composes(command, group, name):
-    config = composed(f"{group}={name}", command=command)
-    assert config["scene"]["volume"]["depth"][0] < config["scene"]["volume"]["depth"][1]
+@functools.cache
+def all_composed() -> dict[tuple[str, str, str], dict]:
+    """Config of each command with each choice of each group."""
+    return {
+        (command, group, name): composed(f"{group}={name}", command=command)
+        for command, groups in GROUPS.items()
+        for group in groups
+        for name in names(group)
+    }
+
+
+def test_every_config_composes():
+    for choice, config in all_composed().items():
+        planned = choice[1:] == ("scene", "capture")  # from its data
+        assert (config["scene"]["volume"]["depth"] is None) == planned, choice
 
 
 @pytest.mark.parametrize("scene", names("scene"))
@@ -135,23 +149,32 @@ def readers(config: dict, path: tuple[str, ...]) -> tuple[str, ...] | None:
     return Objective._fields if path[0] == "objective" else None
 
 
+@pytest.mark.parametrize("command", GROUPS)
+def test_every_key_has_a_rule_and_every_value_keeps_it(command):
+    seen = set()
+    for config in (config for (of, *_), config in all_composed().items() if of == command):
+        check_config(command, OmegaConf.create(config))
+        seen |= {".".join(path) for path, value in leaves(config) if value != {}}
+    rules = KEYS[command]
+    assert {key for key in seen - set(rules) if not key.startswith(FOREIGN_SECTIONS)} == set()
+    # Of what a scene may simulate, and of what it comes from, no config says all.
+    assert {
+        key for key in set(rules) - seen if not key.startswith(("scene.simulate", "scene.source"))
+    } == set()
+
+
 def test_no_key_that_nothing_reads():
     modules = [path for folder in ("nlos_lit", "data_modules") for path in (ROOT / folder).rglob("*.py")]
-    sources = "".join(path.read_text() for path in modules)
+    sources = "".join(path.read_text() for path in modules if path.name != "keys.py")  # it lists, not reads
     used = "".join(re.findall(r"\$\{[\w.]+\}", "".join(path.read_text() for path in CONF.rglob("*.yaml"))))
+    words = set(re.findall(r"\w+", sources + used))
     seen, unread = set(), set()
-    for command, groups in GROUPS.items():
-        for group in groups:
-            for name in names(group):
-                config = composed(f"{group}={name}", command=command)
-                for path, _ in leaves(config):
-                    seen.add(path[-1])
-                    accepted = readers(config, path)
-                    word = rf"\b{re.escape(path[-1])}\b"
-                    if accepted is None and (re.search(word, sources) or re.search(word, used)):
-                        continue
-                    if accepted is None or path[-1] not in accepted:
-                        unread.add(".".join(path))
+    for config in all_composed().values():
+        for path, _ in leaves(config):
+            seen.add(path[-1])
+            accepted = readers(config, path)
+            if path[-1] not in (words if accepted is None else accepted):
+                unread.add(".".join(path))
     assert {
         "effects",
         "refine",
@@ -325,6 +348,27 @@ def test_a_folder_of_another_version_is_one_sentence(tmp_path):
     unread = r"no objective, model.clip, model.rates, scene.volume.refine"
     with pytest.raises(UserError, match=rf"another version .* \(it has {unread}\)"):
         run_config(tmp_path)
+
+
+@pytest.mark.parametrize("path", ["data/mine.hdf5", "../mine.mat", "'my=/mine'"])
+def test_a_capture_of_your_own_is_called_after_its_file(path):
+    config = composed("scene=capture", f"scene.path={path}")
+    assert (config["scene"]["name"], config["scene"]["path"]) == ("mine", path.strip("'"))
+
+
+def test_a_method_of_its_own_door_knows_that_name(tmp_path):
+    (tmp_path / "our lab.mat").touch()
+    asked = ["scene=capture", f"scene.path='{tmp_path}/our lab.mat'", "--cfg=job", "--resolve"]
+    done = subprocess.run(
+        [sys.executable, "reconstruct.py", *asked], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "name: our_lab\n" in done.stdout, done.stderr
+
+
+def test_no_file_name_leaves_the_outputs():
+    assert [file_name(name) for name in ("..", "a/..", "/", "", "~/.ssh/", "x" * 5000, "e/é ü\n*.mat")] == [
+        "capture", "capture", "capture", "capture", "ssh", "x" * 64, "é_ü",
+    ]  # fmt: skip
 
 
 def test_another_optimiser_is_a_word():

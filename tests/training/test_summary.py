@@ -8,9 +8,13 @@ import subprocess
 import numpy as np
 import pytest
 import torch
+from small_capture import fields
 
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.io.files import write_json
 from nlos_lit.runtime.memory import peak_bytes
+from nlos_lit.training.outcome import heldout_scores
 from nlos_lit.training.summary import build_summary, git_state, versions
 
 
@@ -86,3 +90,15 @@ def test_peak_memory_is_bytes_and_never_falls():
     assert 50e6 < before <= after
     assert peak_bytes() == pytest.approx(after, abs=2e6)  # the kernel counts pages in lots
     assert after >= 300e6
+
+
+def test_expected_values_have_no_noise_and_nan_is_no_result():
+    first = {"nmse": 1.0, "nmse_noise_floor": 6.9e30, "deviance_per_bin": 3.0, "deviance_noise": 1.1}
+    counted, expected = (Capture(**fields(is_counts=is_counts)) for is_counts in (True, False))
+    last = {**first, "nmse": 0.5}
+    assert heldout_scores(first, last, counted)["nmse"] == (1.0, 0.5, 6.9e30)
+    told = heldout_scores(first, last, expected)
+    assert told["nmse"][:2] == (1.0, 0.5)
+    assert np.isnan([told["nmse"][2], told["deviance_per_bin"][2]]).all()
+    with pytest.raises(UserError, match=r"the fit has left the numbers \(nmse NaN or infinite\)"):
+        heldout_scores(first, {**first, "nmse": float("nan")}, counted)

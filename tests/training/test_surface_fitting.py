@@ -27,7 +27,8 @@ from nlos_lit.runtime.command_line import quiet_libraries
 from nlos_lit.surfels.fitted import fitted_surfels, score_spots
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import compose
-from nlos_lit.training.run_folder import Run, fitted_of, open_run, prepare_run
+from nlos_lit.training.origin import START, finished_checkpoint
+from nlos_lit.training.run_folder import Run, open_run, prepare_run
 from nlos_lit.training.surface_fitting import SurfaceFitting, front
 from nlos_lit.training.surface_run import excess_note, heldout_excess, load_refined, prepare_surface
 
@@ -260,7 +261,7 @@ def test_events_hold_the_way_of_the_surface(finished):
     assert len(events.Scalars("deviance")) == 52
     assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
     assert {"overview", "surface", "transients", "laser_sensor"} <= set(tags["images"])
-    assert len(events.Images("overview")) == 3  # at the start, after 20, at the end
+    assert len(events.Images("overview")) == 4  # at the start, after 20 and 40, at the end
 
 
 CTRL_C = """
@@ -286,8 +287,7 @@ def test_an_interrupted_sequence_goes_on_in_its_second_half(tmp_path):
     output = done.stdout + done.stderr
     assert done.returncode == 130, output
     line = shlex.split(output.split("go on with: ")[1].splitlines()[0])
-    assert line[:2] == ["python", "train.py"]
-    assert {*sequence, "ckpt_path=last", f"hydra.run.dir={tmp_path / 'stopped'}"} <= set(line)
+    assert line == ["python", "train.py", f"resume={tmp_path / 'stopped'}"]
     assert not (tmp_path / "stopped" / "summary.json").exists()
     again = subprocess.run([sys.executable, *line[1:]], cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert again.returncode == 0, again.stderr
@@ -317,22 +317,20 @@ def test_the_surface_of_a_finished_run_starts_from_its_image_and_response(tmp_pa
         summary["heldout"]["nmse"]["initial"], rel=1e-4
     )
     for changed, sentence in (
-        ("seed=3", "was made with seed=0, this command has 3"),
         ("heldout.block=4", "was made with heldout.block=3, this command has 4"),
         ("scene.sum_bins=2", "was made with scene.sum_bins=1, this command has 2"),
     ):
         with pytest.raises(UserError, match=sentence):
-            fitted_of(first, compose("train", [*SMALL, changed]))
-    assert fitted_of(first, compose("train", [*SMALL, "scene.iterations=7"])).name == "last.ckpt"
-    with pytest.raises(UserError, match=r"of no finished self-calibration: checkpoints/last.ckpt is missing"):
-        fitted_of(tmp_path / "second", compose("train", SMALL))
+            prepare_run(compose("train", [*SMALL, changed]), opens={finished_checkpoint(first): START})
+    with pytest.raises(UserError, match=r"of a finished self-calibration: checkpoints/last.ckpt is missing"):
+        finished_checkpoint(tmp_path / "second")
 
 
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        (["run=nowhere"], "to fit the surface of a finished run give model=surface run=FOLDER"),
-        (["model=surface", "run=nowhere"], "nowhere is not the folder of a finished run"),
+        (["run=tests"], "to fit the surface of a finished run give model=surface run=FOLDER"),
+        (["model=surface", "run=tests"], "tests is not the folder of a finished run"),
         (["model=surface", "trainer=ddp"], "is fitted in one process; found trainer.devices=2"),
     ],
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,12 @@ def train(*overrides: str, folder: Path | None = None, check: bool = True) -> su
     if check:
         assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     return done
+
+
+def run_line(arguments: list[str]) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
+    )
 
 
 def state(folder: Path) -> dict:
@@ -169,7 +176,10 @@ def test_a_finished_folder_is_not_overwritten(finished):
     before = {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()}
     done = train("scene.iterations=1", folder=finished, check=False)
     assert done.returncode == 2
-    assert "already holds a finished run" in done.stderr
+    assert (
+        "already holds a finished run; choose another hydra.run.dir, or go on with it: "
+        f"python train.py resume={finished}"
+    ) in done.stderr
     assert {path: path.stat().st_mtime_ns for path in finished.rglob("*") if path.is_file()} == before
 
 
@@ -196,11 +206,17 @@ def test_resuming_gives_the_uninterrupted_result(finished, tmp_path):
     )  # fmt: skip
     output = done.stdout + done.stderr
     assert done.returncode == 130, output
-    assert "interrupted; go on with: python train.py " in output
-    assert f"scene.iterations=6 logger=none ckpt_path=last hydra.run.dir={folder}\n" in output
+    line = shlex.split(output.split("interrupted; go on with: ")[1].splitlines()[0])
+    assert line == ["python", "train.py", f"resume={folder}"]
     assert not (folder / "summary.json").exists()
     assert state(folder)["epoch"] == 2  # though spots were scored after 1 and 3
-    train("scene.iterations=6", "logger=none", "ckpt_path=last", folder=folder)
+    kept = {name: (folder / name).read_bytes() for name in ("config.yaml", "overrides.json")}
+    done = run_line([*line[1:], "seed=3"])
+    assert done.returncode == 2
+    assert "was made with seed=0, this command has 3" in done.stderr.strip().splitlines()[-1]
+    assert all((folder / name).read_bytes() == content for name, content in kept.items())
+    done = run_line(line[1:])
+    assert done.returncode == 0, done.stderr
     resumed, straight = state(folder)["state_dict"], state(finished)["state_dict"]
     assert resumed.keys() == straight.keys()
     for name in straight:
@@ -281,20 +297,20 @@ def test_every_profile_has_finite_losses_and_gradients(profile):
 BAD = {
     "scene=bike": "needs bike/meas_10min.mat",
     "scene=capture": "scene.path=FILE",
-    "scene=capture scene.path=/nowhere/x.mat": "does not exist",
-    "scene.gate=[200,200]": "leaves no bins",
+    "scene=capture scene.path=/nowhere/x.mat": "must be a file or folder that is there",
+    "scene.gate=[200,200]": "scene.gate must be",
     "scene.volume.depth=[5,6]": "lies outside the capture's time window",
-    "scene.volume.depth=[0.9,0.4]": "nearest < farthest",
-    "effects=[irf_tail,pileup]": "no effect 'pileup'; choose from retroreflection",
+    "scene.volume.depth=[0.9,0.4]": "a < b, or null; found",
+    "effects=[irf_tail,pileup]": "no effect 'pileup'; did you mean pile_up",
     "memory_budget=1MiB": "the budget is",
     "memory_budget=lots": "must be a size",
     "shard_field=true": "needs trainer=ddp and trainer.devices=2 or more; found trainer.devices=1",
     "callbacks.figures._target_=os.system": "callbacks.figures._target_=os.system is not built",
-    "+model.nothing=1": "model has no setting 'nothing'",
+    "+model.nothing=1": "there is no key model.nothing; there are threshold",
     "~callbacks.history": "callbacks must hold History",
-    "model.threshold=1.5": "threshold must lie between 0 and 1",
+    "model.threshold=1.5": "model.threshold must be",
     "heldout.block=50": "hold out",
-    "ckpt_path=nothing.ckpt": "does not exist",
+    "ckpt_path=nothing.ckpt": "ckpt_path must be",
     "scene.reader.bin_width_ps=4 scene.path=README.md": "README.md",
 }
 
@@ -307,7 +323,7 @@ def test_what_cannot_work_is_one_sentence(overrides, tmp_path):
     sentence = done.stderr.strip().splitlines()[-1]
     assert sentence.startswith("error: ")
     assert BAD[overrides] in sentence
-    assert not (tmp_path / "bad" / "checkpoints").exists()
+    assert not (tmp_path / "bad").exists()
 
 
 def test_the_log_says_what_was_read_and_what_it_will_take(finished):

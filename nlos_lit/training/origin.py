@@ -1,0 +1,113 @@
+"""What a fit came from: kept in each of its checkpoints, compared before one of them is opened."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
+
+# Settings that a checkpoint fits no other of, by what goes on from it; the capture is compared itself.
+START = ("seed", "heldout", "scene.volume")  # a surface, from the image of a finished run
+IMAGE = (*START, "model", "ablation.optimise", "batch_spots", "objective", "optimizer")
+SURFACE = (*IMAGE, "surfels", "effects")
+# Settings of a scene that make neither the capture nor its volume.
+BESIDE = ("scene.name", "scene.iterations", "scene.threshold", "scene.wavelength", "scene.falloff")
+TOLD = 4  # differences that a message names
+
+
+def origin_of(settings: Mapping[str, Any], capture: Capture) -> dict[str, Any]:
+    """What a fit comes from, in plain containers that a checkpoint can hold.
+
+    Args:
+        settings: resolved, of ``train.py``.
+        capture: as the scene's settings make it.
+
+    Returns:
+        ``capture``, its hash, and ``settings``, by dotted name.
+    """
+    sections = {name.split(".")[0] for name in SURFACE} | {"scene"}
+    shaping = {name: settings[name] for name in sections}
+    if isinstance(shaping["effects"], str):
+        shaping["effects"] = [shaping["effects"]]
+    return {"capture": capture.digest(), "settings": _flat(shaping)}
+
+
+def check_origin(file: Path, origin: Mapping[str, Any], sections: Sequence[str]) -> None:
+    """Refuse a checkpoint of another capture, or of other settings.
+
+    Args:
+        file: the checkpoint.
+        origin: of the run that is to open it.
+        sections: of the settings that must be the same: START, IMAGE or SURFACE.
+
+    Raises:
+        UserError: it is another's, with what differs, or no checkpoint of this project.
+    """
+    kept = read_checkpoint(file)["origin"]
+    theirs, mine = kept["settings"], origin["settings"]
+    differ = [
+        name
+        for name in sorted(theirs.keys() | mine.keys())
+        if theirs.get(name) != mine.get(name) and name not in BESIDE
+    ]
+    told = [name for name in differ if any(f"{name}.".startswith(f"{section}.") for section in sections)]
+    same_capture = kept["capture"] == origin["capture"]
+    if not same_capture:  # the scene's settings may tell why
+        told += [name for name in differ if name.startswith("scene.") and name not in told]
+    words = [f"{name}={theirs.get(name)}, this command has {mine.get(name)}" for name in told[:TOLD]]
+    if not same_capture:
+        words.append("another capture than this command's")
+    if words:
+        raise UserError(f"{file} was made with {'; '.join(words)}: give the same, or begin anew without it")
+
+
+def read_checkpoint(file: Path) -> dict[str, Any]:
+    """A checkpoint of a fit, on the CPU; it may come from anywhere.
+
+    Raises:
+        UserError: it is damaged, or does not say what it was fitted to.
+    """
+    try:
+        state = torch.load(file, map_location="cpu", weights_only=True)
+    except Exception as error:  # a foreign file may be wrong in any way
+        raise UserError(f"{file} is damaged, or no checkpoint: give one of a run's checkpoints/") from error
+    if not isinstance(state, dict) or "origin" not in state:
+        raise UserError(
+            f"{file} does not say which capture and settings it was fitted with (another version of this "
+            "project wrote it): train the scene again"
+        )
+    return state
+
+
+def finished_checkpoint(folder: Path) -> Path:
+    """The last checkpoint of a self-calibration that was carried through.
+
+    Raises:
+        UserError: the folder holds none, or one that stopped before its end.
+    """
+    file = folder / "checkpoints" / "last.ckpt"
+    if not file.is_file():
+        raise UserError(
+            f"{folder} is not the folder of a finished self-calibration: checkpoints/last.ckpt is missing"
+        )
+    state = read_checkpoint(file)
+    if "final" not in state.get("scores", ()):
+        raise UserError(
+            f"the run in {folder} was stopped after {state.get('epoch', -1) + 1} iterations; "
+            f"finish it first: python train.py {shlex.quote(f'resume={folder}')}"
+        )
+    return file
+
+
+def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        found |= _flat(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
+    return found
