@@ -2,7 +2,7 @@
 
 import sys
 
-from nlos_lit.commands.inspect_capture import inspect_capture
+from nlos_lit.commands.nlos import open_command
 
 if __name__ == "__main__":
-    sys.exit(inspect_capture(sys.argv[1:]))
+    sys.exit(open_command("inspect", sys.argv[1:]))

@@ -18,10 +18,10 @@ from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_tru
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
+from nlos_lit.places import CONF
 
 log = logging.getLogger(__name__)
 SMALLEST, LARGEST = 1e-15, 1e12  # of a capture's largest value; squares of it stand in single precision
-SCENE_CONFIGS = Path(__file__).resolve().parents[1] / "conf" / "scene"
 
 
 def load_scene(
@@ -156,7 +156,7 @@ def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:
 @functools.cache
 def shipped_sources() -> list[dict[str, Any]]:
     """Where the data of this project's own scenes come from."""
-    configs = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in SCENE_CONFIGS.glob("*.yaml"))
+    configs = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in (CONF / "scene").glob("*.yaml"))
     return [config["source"] for config in configs if config.get("source")]
 
 

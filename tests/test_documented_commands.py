@@ -10,8 +10,9 @@ import pytest
 from conftest import ROOT
 
 from nlos_lit.commands import inspect_capture, results
+from nlos_lit.places import CONF
 from nlos_lit.runtime import schema
-from nlos_lit.runtime.arguments import CONF, check_assignments, check_overrides, help_of
+from nlos_lit.runtime.arguments import check_assignments, check_overrides, help_of
 from nlos_lit.runtime.keys import KEYS
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])

@@ -6,21 +6,18 @@ import sys
 from pathlib import Path
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.runtime.command_line import as_typed
 from nlos_lit.training.sweep_table import run_rows, table
 
+ABOUT = """Runs side by side, where they differ and what came out: nlos compare RUN RUN …
 
-def compare(arguments: list[str], about: str | None) -> int:
-    """Print a table of the runs whose folders ``arguments`` name.
+RUN is the folder of a finished run. Runs that differ in the seed alone are put together below."""
 
-    Args:
-        arguments: of the command line.
-        about: what ``--help`` prints.
 
-    Returns:
-        The exit status.
-    """
+def main(arguments: list[str]) -> int:
+    """Print a table of the runs whose folders ``arguments`` name, and return the exit status."""
     if {"-h", "--help"} & set(arguments):
-        print((about or "").strip())
+        print(as_typed(ABOUT))
         return 0
     try:
         if len(arguments) < 2:

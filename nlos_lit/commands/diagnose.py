@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
+from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose as diagnose_capture
@@ -31,6 +32,11 @@ from nlos_lit.training.folder import resolved, take_folder, take_given_folder, w
 from nlos_lit.training.run_folder import Run, open_run
 
 log = logging.getLogger(__name__)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command with the arguments of its command line; the exit status."""
+    return compose_and_run("diagnose", prepare, diagnose, arguments)
 
 
 @sentence_errors

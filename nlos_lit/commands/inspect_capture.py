@@ -10,9 +10,10 @@ from data_modules.examine import describe, examine
 from data_modules.readers import READERS, ReaderOptions, detect_format, read_capture
 from nlos_lit.capture.errors import UserError, printable
 from nlos_lit.report.capture_figure import draw_capture
+from nlos_lit.runtime.command_line import typed
 
 
-def inspect_capture(arguments: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Print what the file named by ``arguments`` holds, draw it, and return the exit status."""
     given = parse(arguments).__dict__
     path, fmt, out = given.pop("file"), given.pop("format"), given.pop("out")
@@ -42,7 +43,9 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description="Print and plot what a capture file holds.")
+    parser = argparse.ArgumentParser(
+        prog=typed("inspect"), description="Print and plot what a capture file holds."
+    )
     parser.add_argument("file", type=Path, help="capture file, or folder of C_i, C_d, sub_Sig")
     parser.add_argument(
         "--format", default="auto", help=f"auto, or one of {', '.join(reader.NAME for reader in READERS)}"

@@ -11,6 +11,7 @@ from data_modules.load import load_scene
 from nlos_lit.baselines import estimate_bytes, reconstruct_directed
 from nlos_lit.baselines.surface import front_points
 from nlos_lit.capture.volume_grid import volume_grid
+from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.io.files import write_json
 from nlos_lit.io.points import write_points
 from nlos_lit.io.volumes import write_volume
@@ -23,6 +24,11 @@ from nlos_lit.training.folder import register_names, resolved, take_folder, take
 from nlos_lit.training.summary import git_state, versions
 
 log = logging.getLogger(__name__)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command with the arguments of its command line; the exit status."""
+    return compose_and_run("reconstruct", prepare, reconstruct, arguments)
 
 
 @sentence_errors

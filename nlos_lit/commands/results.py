@@ -10,15 +10,24 @@ from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.paper.experiments import EXPERIMENTS
 from nlos_lit.paper.page import update_page
 from nlos_lit.paper.subjects import SIZES
-from nlos_lit.paper.workspace import ROOT, Workspace
+from nlos_lit.paper.workspace import Workspace
+from nlos_lit.places import HOME
+from nlos_lit.runtime.command_line import sentence_errors
 
 log = logging.getLogger(__name__)
 DEFAULTS = {
     "size": "full",
-    "data": str(ROOT / "data"),
+    "data": str(HOME / "data"),
     "out": "",  # outputs/evidence/SIZE
-    "docs": str(ROOT / "docs" / "results.md"),
+    "docs": str(HOME / "docs" / "results.md"),
 }
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command with the arguments of its command line; the exit status."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    sentence_errors(results)(arguments)
+    return 0
 
 
 def parse(arguments: list[str]) -> tuple[list[str], dict[str, str]]:
@@ -61,7 +70,7 @@ def results(arguments: list[str]) -> None:
     """
     names, options = parse(arguments)
     size = SIZES[options["size"]]
-    out = Path(options["out"]) if options["out"] else ROOT / "outputs" / "evidence" / size.name
+    out = Path(options["out"]) if options["out"] else HOME / "outputs" / "evidence" / size.name
     work = Workspace(out, size.experiment, [Path(options["data"])])
     for name in names:
         began = time.perf_counter()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -31,6 +32,7 @@ from data_modules.simulate import (
 )
 from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime.arguments import check_assignments
+from nlos_lit.runtime.command_line import sentence_errors
 from nlos_lit.runtime.memory import check_disk
 from nlos_lit.surfels.measure import measure
 
@@ -39,6 +41,13 @@ SCENE_HELP = (
     f"bodies=[{{kind: sphere, radius: 0.1, at: [0, 0, 0.6]}}, …], kinds {', '.join(b.kind for b in BODIES)}; "
     "or random=SEED"
 )
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command with the arguments of its command line; the exit status."""
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    sentence_errors(simulate)(arguments)
+    return 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,15 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.model.laser_sensor import LaserSensor
-from nlos_lit.runtime.command_line import output_folder, quiet_libraries, quote_numbers, sentence_errors
+from nlos_lit.runtime.command_line import (
+    output_folder,
+    quiet_libraries,
+    quote_numbers,
+    sentence_errors,
+    typed,
+)
 from nlos_lit.runtime.memory import check_disk
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import register_settings, run_config
@@ -48,6 +55,11 @@ from nlos_lit.training.surface_run import prepare_surface, write_surface
 
 log = logging.getLogger(__name__)
 C = TypeVar("C", bound=L.Callback)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command with the arguments of its command line; the exit status."""
+    return compose_and_run("train", prepare, train, arguments)
 
 
 @sentence_errors
@@ -88,7 +100,8 @@ def train(config: DictConfig) -> None:
         summary = fit(settings, of_surface, folder, checkpoint, began)
     except KeyboardInterrupt:
         if (folder / OVERRIDES).exists():
-            log.info("interrupted; go on with: python train.py %s", shlex.quote(f"resume={folder}"))
+            again = shlex.quote(f"resume={folder}")
+            log.info("interrupted; go on with: %s %s", typed("train"), again)
         else:
             log.info("interrupted before the first iteration; begin again with the same command")
         sys.exit(130)

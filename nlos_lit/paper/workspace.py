@@ -24,12 +24,12 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.io.files import whole_file
+from nlos_lit.places import HOME
 from nlos_lit.training.configs import compose
 from nlos_lit.training.folder import OVERRIDES
 
 log = logging.getLogger(__name__)
 
-ROOT = Path(__file__).resolve().parents[2]
 Arrays = dict[str, np.ndarray]
 
 
@@ -118,9 +118,9 @@ def _train(arguments: list[str], output: Path) -> None:
     with output.open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)
-    os.chdir(ROOT)
-    sys.argv = [str(ROOT / "train.py"), *arguments]
-    runpy.run_path(sys.argv[0], run_name="__main__")
+    os.chdir(HOME)
+    sys.argv = ["nlos", "train", *arguments]
+    runpy.run_module("nlos_lit", run_name="__main__")
 
 
 class Workspace:

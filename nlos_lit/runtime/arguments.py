@@ -23,25 +23,25 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError, suggest
-from nlos_lit.runtime.command_line import output_folder
+from nlos_lit.places import CONF
+from nlos_lit.runtime.command_line import as_typed, output_folder
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 OF_HYDRA = ("hydra", "profile")
 RESUME = "resume"  # of train.py, and no key of its config: what was begun is read from that folder
 
 
-def look_over(command: str, arguments: list[str], about: str | None) -> None:
+def look_over(command: str, arguments: list[str], about: str) -> None:
     """Print help and exit, or exit with status 2 and a sentence where an argument cannot work.
 
     Args:
         command: the program's name, without ``.py``.
-        arguments: of the command line, the program's name first.
-        about: the program's docstring, for ``--help``.
+        arguments: of the command line.
+        about: first lines of ``--help``.
     """
-    given = get_args_parser().parse_known_args(arguments[1:])[0]
+    given = get_args_parser().parse_known_args(arguments)[0]
     if given.help:
-        print(help_of(command, about or ""))
+        print(help_of(command, about))
         sys.exit(0)
     if given.config_dir or given.config_path or given.config_name:
         return  # a config of somebody's own, with keys of its own
@@ -49,7 +49,7 @@ def look_over(command: str, arguments: list[str], about: str | None) -> None:
         if (CONF / f"{command}.yaml").exists():
             check_overrides(command, given.overrides)
         elif command in KEYS:
-            check_assignments(command, arguments[1:])
+            check_assignments(command, arguments)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -174,7 +174,7 @@ def _check_override(command: str, override: Override) -> None:
     if key not in rules:
         if override.is_add() and key.startswith("trainer."):
             return
-        raise UserError(f"there is no key {key}; {_instead(key, [*rules, *groups])}")
+        raise UserError(f"there is no key {key}; {_instead(key, dict.fromkeys([*rules, *groups]))}")
     if not override.is_delete():
         for value in _values(override):
             problem = None if _is_late(value) else rules[key].problem(value)
@@ -189,7 +189,9 @@ def _instead(key: str, known: Iterable[str]) -> str:
     beside = dict.fromkeys(other[len(start) :].split(".")[0] for other in known if other.startswith(start))
     if section and beside:
         return suggest(name, beside)
-    return suggest(key, [*known, *beside], dict.fromkeys(other.split(".")[0] for other in known))
+    return suggest(
+        key, dict.fromkeys([*known, *beside]), dict.fromkeys(other.split(".")[0] for other in known)
+    )
 
 
 def _values(override: Override) -> Iterator[Any]:
@@ -289,7 +291,7 @@ def help_of(command: str, about: str) -> str:
         lines += ["", "Settings, KEY=VALUE (lists in quotes: 'KEY=[1,2]'):"]
     for key, rule in KEYS.get(command, {}).items():
         lines.append(f"  {key}: {rule}" + (f"  # {meaning[key]}" if key in meaning else ""))
-    return "\n".join(lines)
+    return as_typed("\n".join(lines))
 
 
 def comments(file: Path) -> dict[str, str]:

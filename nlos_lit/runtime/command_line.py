@@ -16,6 +16,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.places import INSTALLED
 
 _FULL = "make room, or write elsewhere"
 _CLOSED = "change who may write there, or give another place"
@@ -26,6 +27,33 @@ REFUSED = MappingProxyType(
     | {errno.EROFS: _CLOSED, errno.EACCES: _CLOSED, errno.EPERM: _CLOSED}
     | {errno.ENOTDIR: _NAMED, errno.EISDIR: _NAMED, errno.EEXIST: _NAMED, errno.ENAMETOOLONG: _NAMED}
 )
+
+
+FILES = MappingProxyType({"inspect": "inspect_capture"})  # at the top of a checkout, where named otherwise
+
+
+def typed(command: str) -> str:
+    """How a command is started: as ``nlos`` does, or by its file at the top of a checkout.
+
+    Examples:
+        >>> typed("inspect")
+        'python inspect_capture.py'
+    """
+    program = Path(sys.argv[0])
+    if INSTALLED or program.stem == "nlos" or program.parts[-2:] == ("nlos_lit", "__main__.py"):
+        return f"nlos {command}"
+    return f"python {FILES.get(command, command)}.py"
+
+
+def as_typed(text: str) -> str:
+    """A text whose commands, ``nlos NAME`` or ``python NAME.py``, are written as the user started this one.
+
+    Examples:
+        >>> as_typed("nlos train scene=su; python train.py scene=su")
+        'python train.py scene=su; python train.py scene=su'
+    """
+    names = {file: command for command, file in FILES.items()}
+    return re.sub(r"\b(?:nlos|python) (\w+)\b(?:\.py)?", lambda m: typed(names.get(m[1], m[1])), text)
 
 
 def sentence_errors(task: Callable[..., Any]) -> Callable[..., Any]:

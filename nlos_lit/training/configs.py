@@ -23,11 +23,11 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
+from nlos_lit.places import CONF
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.folder import register_names
 from nlos_lit.training.instantiate import arguments_of
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
 SETTINGS: dict[str, type] = {
     "model": PipelineSettings,
     "surfels": SurfelSettings,

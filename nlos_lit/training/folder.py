@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from nlos_lit.capture.errors import UserError
 from nlos_lit.io.files import whole_file, write_json
 from nlos_lit.runtime.claim import claim
-from nlos_lit.runtime.command_line import given_values
+from nlos_lit.runtime.command_line import given_values, typed
 
 OUTPUTS = "outputs"  # where results go that no other folder is given for
 OVERRIDES = "overrides.json"  # the settings that a training was begun with
@@ -72,7 +72,7 @@ def take_folder(folder: Path, goes_on: bool = False) -> None:
         again = shlex.quote(f"resume={folder}")
         raise UserError(
             f"{folder} already holds {found}; choose another hydra.run.dir"
-            + (f", or go on with it: python train.py {again}" if (folder / OVERRIDES).exists() else "")
+            + (f", or go on with it: {typed('train')} {again}" if (folder / OVERRIDES).exists() else "")
         )
 
 

@@ -11,6 +11,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.runtime.command_line import typed
 
 # Settings that a checkpoint fits no other of, by what goes on from it; the capture is compared itself.
 START = ("seed", "heldout", "scene.volume")  # a surface, from the image of a finished run
@@ -100,7 +101,7 @@ def finished_checkpoint(folder: Path) -> Path:
     if "final" not in state.get("scores", ()):
         raise UserError(
             f"the run in {folder} was stopped after {state.get('epoch', -1) + 1} iterations; "
-            f"finish it first: python train.py {shlex.quote(f'resume={folder}')}"
+            f"finish it first: {typed('train')} {shlex.quote(f'resume={folder}')}"
         )
     return file
 

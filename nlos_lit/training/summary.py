@@ -12,10 +12,10 @@ from typing import Any
 import torch
 
 import nlos_lit
+from nlos_lit.places import ABOVE
 from nlos_lit.runtime.memory import peak_bytes
 
 PACKAGES = ("torch", "lightning", "numpy", "open3d", "hydra-core", "omegaconf", "h5py", "scipy", "matplotlib")
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def build_summary(
@@ -76,7 +76,7 @@ def versions() -> dict[str, str | None]:
     return found
 
 
-def git_state(root: Path = ROOT) -> dict[str, Any] | None:
+def git_state(root: Path = ABOVE) -> dict[str, Any] | None:
     """``{"commit", "dirty"}`` of a checkout; dirty: a tracked file differs.
 
     None where ``root`` is not the top of one.

@@ -28,6 +28,7 @@ from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.report.surface_figures import FrontImage
 from nlos_lit.report.words import AXES
+from nlos_lit.runtime.command_line import typed
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.surfels.fitted import FittedSurfels, fitted_surfels
 from nlos_lit.surfels.model import SurfelModel
@@ -177,7 +178,7 @@ def excess_note(excess: Excess, folder: Path) -> str | None:
     return (
         f"the fitted surface leaves {100 * (excess.ratio - 1):.0f} % more than counting noise "
         f"({'of it ' + ', '.join(where) if where else 'hardly any along time, wall, scan or rate'}); "
-        f"python diagnose.py {shlex.quote(f'run={folder}')} asks what is missing"
+        f"{typed('diagnose')} {shlex.quote(f'run={folder}')} asks what is missing"
     )
 
 
@@ -199,7 +200,7 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
         if not (place / name).is_file():
             raise UserError(
                 f"{folder} holds no refined surfels: refined/{name} is missing; "
-                "run train.py with refine=true, effects=[…] or model=surface"
+                f"run {typed('train')} with refine=true, effects=[…] or model=surface"
             )
     saved = torch.load(place / "effects.pt", map_location="cpu", weights_only=True)
     extension = Extension(build_effects(saved["names"], Scan.of(capture)))

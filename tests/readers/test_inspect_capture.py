@@ -11,7 +11,7 @@ import scipy.io
 
 from data_modules.examine import examine
 from data_modules.readers import READERS, read_capture
-from nlos_lit.commands.inspect_capture import inspect_capture
+from nlos_lit.commands.inspect_capture import main as inspect_capture
 
 ROOT = Path(__file__).resolve().parents[2]
 

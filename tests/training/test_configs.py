@@ -26,10 +26,11 @@ from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.commands.train import make_trainer
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.model.objective import Objective
+from nlos_lit.places import CONF
 from nlos_lit.runtime.arguments import check_config
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.training.configs import CONF, SETTINGS, compose, run_config, settings_of
+from nlos_lit.training.configs import SETTINGS, compose, run_config, settings_of
 from nlos_lit.training.folder import file_name
 
 

@@ -1,0 +1,46 @@
+"""Commands whose config Hydra puts together, from ``conf/`` wherever that lies."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import hydra
+from omegaconf import DictConfig
+
+from nlos_lit.commands.plan import plan
+from nlos_lit.places import CONF
+from nlos_lit.runtime.arguments import begun
+from nlos_lit.runtime.command_line import sentence_errors
+
+
+def compose_and_run(
+    name: str,
+    prepare: Callable[[list[str]], None],
+    task: Callable[[DictConfig], Any],
+    arguments: list[str],
+) -> int:
+    """Compose a command's config, plan what it leaves to the data, and run it.
+
+    Args:
+        name: of the command and its config.
+        prepare: changes the command line, the program's name first, before Hydra reads it.
+        task: what the command does; what it returns a sweep can optimise.
+        arguments: as on the command line. They are put there: Hydra reads them there, and so do the processes
+            that Lightning starts.
+
+    Returns:
+        The exit status.
+    """
+    sys.argv[1:] = arguments
+    prepare(sys.argv)
+
+    @sentence_errors
+    def run(config: DictConfig) -> Any:
+        with begun(name, config):
+            plan(config)
+            return task(config)
+
+    hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)()
+    return 0

@@ -1,0 +1,156 @@
+"""The program ``nlos``: one name for all commands, each opened by its own module when it is asked for."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import os
+import sys
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import nlos_lit
+
+STARTED = "NLOS_COMMAND"  # in the environment: what further processes of a run are to be
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command.
+
+    Args:
+        does: what it does, in a line.
+        example: its arguments, for the list of all commands.
+        more: further paragraphs of its ``--help``.
+        module: of ``nlos_lit.commands``, whose ``main`` takes the arguments and returns the exit status; None
+            is that of the command's own name.
+        settings: its arguments are ``KEY=VALUE``, looked over before the module is loaded.
+    """
+
+    does: str
+    example: str
+    more: str = ""
+    module: str | None = None
+    settings: bool = False
+
+    @property
+    def about(self) -> str:
+        """The first lines of its ``--help``."""
+        return f"{self.does[0].upper()}{self.does[1:]}." + (f"\n\n{self.more}" if self.more else "")
+
+
+SIMULATE = """\
+Writes OUT, a y-tal HDF5 capture, and OUT's name with _truth.h5: depth, normals and albedo as seen from the
+wall, and the mesh. A scene of one's own: 'bodies=[{kind: cone, at: [0, 0, 0.6]}]'; one drawn at random:
+random=7 (docs/simulator.md). With physical effects, each with strengths as EFFECT.PARAMETER=VALUE
+(docs/effects.md):
+
+    nlos simulate scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5"""
+RESULTS = """\
+Names are experiments, all, or page, which rewrites the generated parts of docs/results.md from what is
+stored.
+
+size=full|reduced   full (default): real captures, renders and the bunny; about an hour on one core.
+                    reduced: small procedural scenes in their places, every command once in a few minutes
+data=DIR            folder that is searched for captures and meshes (default: data)
+out=DIR             where results are kept and found again (default: outputs/evidence/SIZE); finished
+                    trainings are never repeated
+docs=FILE           the page (default: docs/results.md)"""
+COMMANDS = MappingProxyType(
+    {
+        "look": Command(
+            "look at a capture file: recognise, check, plan and picture it, and say what to do next",
+            "FILE",
+        ),
+        "train": Command("reconstruct a hidden scene by self-calibration", "scene=su", settings=True),
+        "diagnose": Command(
+            "say what the simulation gets wrong about a capture, or about a finished run (run=FOLDER)",
+            "scene=su",
+            settings=True,
+        ),
+        "reconstruct": Command(
+            "reconstruct by a classical method, without fitting", "scene=su method=lct", settings=True
+        ),
+        "simulate": Command(
+            "simulate a capture of a hidden scene",
+            "scene=letters out=letters.hdf5",
+            more=SIMULATE,
+            settings=True,
+        ),
+        "inspect": Command("print and plot what a capture file holds", "FILE", module="inspect_capture"),
+        "compare": Command("show where finished runs differ, and what came out", "RUN RUN"),
+        "view": Command("open the page of a run or a diagnosis", "RUN"),
+        "results": Command(
+            "make the paper's tables and figures",
+            "table1 size=reduced",
+            more=RESULTS,
+            settings=True,
+        ),
+        "completion": Command("print what makes a shell complete these commands", "bash"),
+    }
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command.
+
+    Args:
+        arguments: its name and its own arguments; None takes them from the command line.
+
+    Returns:
+        The exit status.
+    """
+    given = sys.argv[1:] if arguments is None else arguments
+    if STARTED in os.environ and os.environ.get("LOCAL_RANK", "0") != "0":
+        given = [os.environ[STARTED], *given]  # Lightning starts helpers with the command's arguments alone
+    name = given[0] if given else "--help"
+    if name in ("-h", "--help"):
+        print(listed())
+        return 0
+    if name == "--version":
+        print(nlos_lit.__version__)
+        return 0
+    if name not in COMMANDS:
+        near = difflib.get_close_matches(name, COMMANDS, n=2)
+        instead = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(COMMANDS)}"
+        print(f"error: there is no command {name!r}; {instead}", file=sys.stderr)
+        return 2
+    os.environ[STARTED] = name
+    return open_command(name, given[1:])
+
+
+def open_command(name: str, arguments: list[str]) -> int:
+    """Load a command and run it.
+
+    Args:
+        name: in :data:`COMMANDS`.
+        arguments: without the name.
+
+    Returns:
+        The exit status.
+    """
+    command = COMMANDS[name]
+    if command.settings:
+        from nlos_lit.runtime.arguments import look_over
+
+        look_over(name, arguments, command.about)
+    module = importlib.import_module(f"nlos_lit.commands.{command.module or name}")
+    status: int = module.main(arguments)
+    return status
+
+
+def listed() -> str:
+    """All commands with what they do, as ``nlos --help`` shows them."""
+    width = max(len(f"{name} {command.example}") for name, command in COMMANDS.items())
+    lines = [
+        f"  nlos {f'{name} {command.example}':{width}s}  {command.does}" for name, command in COMMANDS.items()
+    ]
+    return "\n".join(
+        [
+            "Non-line-of-sight imaging that calibrates and criticises its own simulation.",
+            "",
+            *lines,
+            "",
+            "nlos COMMAND --help lists what a command takes; nlos --version is the version.",
+        ]
+    )

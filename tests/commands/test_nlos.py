@@ -1,0 +1,94 @@
+"""One program for all commands: what it lists, opens, refuses and completes."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+import subprocess
+
+import pytest
+from conftest import ROOT
+
+from nlos_lit.commands import nlos
+from nlos_lit.commands.completion import bash, words_of, zsh
+from nlos_lit.commands.completion import main as completion
+from nlos_lit.commands.nlos import COMMANDS, STARTED, main
+from nlos_lit.runtime import command_line
+from nlos_lit.runtime.command_line import as_typed, typed
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_its_module(name):
+    module = COMMANDS[name].module or name
+    assert importlib.util.find_spec(f"nlos_lit.commands.{module}") is not None
+    assert "def main(arguments: list[str]) -> int:" in (
+        ROOT / "nlos_lit" / "commands" / f"{module}.py"
+    ).read_text(encoding="utf-8")
+
+
+def test_a_misspelt_command_is_answered_with_the_nearest(capsys, monkeypatch):
+    monkeypatch.delenv(STARTED, raising=False)
+    assert main(["trian"]) == 2
+    assert "there is no command 'trian'; did you mean train?" in capsys.readouterr().err
+    assert main(["xyz"]) == 2
+    assert f"there are {', '.join(COMMANDS)}" in capsys.readouterr().err
+    for words in ([], ["--help"]):
+        assert main(words) == 0
+        assert "nlos look FILE" in capsys.readouterr().out
+
+
+def test_processes_that_help_with_a_run_open_its_command(monkeypatch):
+    opened = []
+    monkeypatch.setattr(nlos, "open_command", lambda name, words: opened.append((name, words)) or 0)
+    monkeypatch.setenv(STARTED, "before")
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    assert main(["train", "trainer=ddp"]) == 0
+    monkeypatch.setenv("LOCAL_RANK", "1")
+    assert main(["trainer=ddp"]) == 0
+    assert opened == [("train", ["trainer=ddp"])] * 2
+
+
+def test_commands_are_told_as_they_are_typed(monkeypatch):
+    monkeypatch.setattr(command_line.sys, "argv", ["/somewhere/bin/nlos"])
+    assert typed("train") == "nlos train"
+    assert as_typed("python inspect_capture.py X, python train.py") == "nlos inspect X, nlos train"
+    monkeypatch.setattr(command_line.sys, "argv", ["train.py"])
+    assert as_typed("nlos inspect X, nlos train") == "python inspect_capture.py X, python train.py"
+
+
+def completed(line: str) -> list[str]:
+    """What bash offers behind a line."""
+    code = f"""{bash()}
+COMP_LINE={line!r} COMP_POINT={len(line)}
+COMP_WORDS=({line.replace("=", " = ")})
+COMP_CWORD=$(( ${{#COMP_WORDS[@]}} - 1 ))
+[[ $COMP_LINE == *" " ]] && COMP_CWORD=$(( COMP_CWORD + 1 ))
+compopt() {{ :; }}
+_nlos
+printf '%s\\n' "${{COMPREPLY[@]}}"
+"""
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return done.stdout.split()
+
+
+def test_bash_completes_commands_keys_and_choices():
+    assert completed("nlos re") == ["reconstruct", "results"]
+    assert completed("nlos train scene=s") == ["su"]
+    assert completed("nlos train scene.iter") == ["scene.iterations="]
+    assert completed("nlos reconstruct method=f") == ["fbp", "fk"]
+
+
+def test_zsh_reads_the_completion(capsys):
+    assert completion(["zsh"]) == 0
+    assert capsys.readouterr().out.strip() == zsh().strip()
+    assert all(word in zsh() for word in words_of("train"))
+    if shutil.which("zsh") is None:
+        pytest.skip("zsh is not installed: the script is not read by it")
+    subprocess.run(["zsh", "-n"], input=zsh(), text=True, check=True)
+
+
+def test_completion_names_the_shells(capsys):
+    assert completion(["bsh"]) == 2
+    assert "did you mean bash" in capsys.readouterr().err
+    assert completion(["--help"]) == 0
