@@ -26,6 +26,7 @@ from nlos_lit.runtime.claim import claim
 from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors, stay_in_run
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.runtime.progress import StepTicker
+from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import register_settings, settings_of
 from nlos_lit.training.folder import resolved, take_folder, take_given_folder, write_config
@@ -56,8 +57,7 @@ def diagnose(config: DictConfig) -> None:
     """
     began = time.perf_counter()
     folder = output_folder()
-    if config.threads:
-        torch.set_num_threads(config.threads)
+    choose_threads(config.threads)
     run, settings = None, resolved(config)
     if config.run is None:
         take_folder(folder)

@@ -20,6 +20,7 @@ from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors
 from nlos_lit.runtime.memory import check_disk, check_machine, parse_bytes, peak_bytes
+from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.training.folder import register_names, resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.summary import git_state, versions
 
@@ -49,6 +50,7 @@ def reconstruct(config: DictConfig) -> None:
     folder = output_folder()
     take_folder(folder)
     settings = resolved(config)
+    choose_threads(settings["threads"])
     write_config(settings, folder)
     scene, method = settings["scene"], settings["method"]
     capture, truth = load_scene(scene, settings["data_dir"], settings["seed"])

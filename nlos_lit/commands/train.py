@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import lightning as L
-import torch
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig
@@ -28,6 +27,7 @@ from nlos_lit.runtime.command_line import (
     typed,
 )
 from nlos_lit.runtime.memory import check_disk
+from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import register_settings, run_config
 from nlos_lit.training.folder import (
@@ -91,8 +91,7 @@ def train(config: DictConfig) -> None:
     config.folder = str(folder)
     settings = resolved(config)
     L.seed_everything(settings["seed"], verbose=False)
-    if settings["threads"]:
-        torch.set_num_threads(settings["threads"])
+    choose_threads(settings["threads"], 1 if settings["trainer"]["devices"] in (1, "auto") else 2)
     config.folder = str(folder / "refined")
     of_surface = surface_settings(resolved(config), alone)
     fit = _surface_alone if alone else _self_calibration

@@ -269,7 +269,7 @@ _modelled = _scene | _below("model", MODEL) | _below("surfels", SURFELS)
 KEYS: dict[str, dict[str, Rule]] = {
     "train": _modelled | _below("trainer", TRAINER) | TRAIN,
     "diagnose": _modelled | _below("criticism", CRITICISM) | {"run": optional(FILE)},
-    "reconstruct": {key: rule for key, rule in _scene.items() if key != "threads"} | _below("method", METHOD),
+    "reconstruct": _scene | _below("method", METHOD),
     "simulate": SIMULATE,
 }
 # Sections that name a class with its arguments, which that class checks when it is built.
