@@ -46,7 +46,7 @@ def load_scene(
     else:
         scene = planned_scene(scene, data_dir)[0]
         path = find_file(scene, Path(data_dir))
-        capture, truth = read_capture(path, scene["format"], options=_options(scene["reader"])), None
+        capture, truth = read_capture(path, scene["format"], options=reader_options(scene["reader"])), None
     if scene["truth"] is not None:
         truth = _truth(load_truth(Path(scene["truth"])))
     capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
@@ -78,7 +78,7 @@ def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[
     if scene["sum_bins"] is not None and depth is not None:
         return dict(scene), None
     path = find_file(scene, Path(data_dir))
-    capture = read_capture(path, scene["format"], options=_options(scene["reader"]))
+    capture = read_capture(path, scene["format"], options=reader_options(scene["reader"]))
     capture = capture.sum_spots(scene["sum_spots"])
     plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
     if depth is None and plan.depth is None:
@@ -160,7 +160,8 @@ def shipped_sources() -> list[dict[str, Any]]:
     return [config["source"] for config in configs if config.get("source")]
 
 
-def _options(reader: Mapping[str, Any]) -> ReaderOptions:
+def reader_options(reader: Mapping[str, Any]) -> ReaderOptions:
+    """What the section ``reader`` of a scene says."""
     values = dict(reader)
     if isinstance(values["wall_size"], list):
         values["wall_size"] = tuple(values["wall_size"])
