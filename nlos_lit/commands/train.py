@@ -71,10 +71,13 @@ def prepare(arguments: list[str]) -> None:
     register_settings()
 
 
-def train(config: DictConfig) -> None:
+def train(config: DictConfig) -> float | None:
     """Fit as ``conf/train.yaml`` says, export, and say what came out.
 
     That is a self-calibration, the surface, or with ``refine=true`` the one and then the other.
+
+    Returns:
+        The held-out NMSE after the fit, which a sweeper can bring down; None in processes that only help.
 
     Raises:
         UserError: the data, the geometry or the settings cannot work.
@@ -104,8 +107,10 @@ def train(config: DictConfig) -> None:
         else:
             log.info("interrupted before the first iteration; begin again with the same command")
         sys.exit(130)
-    if summary is not None:
-        _tell(summary, folder)
+    if summary is None:
+        return None
+    _tell(summary, folder)
+    return float(summary["heldout"]["nmse"]["final"])
 
 
 def _self_calibration(

@@ -7,16 +7,22 @@ import logging
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import yaml
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table, write_csv
+from nlos_lit.io.volumes import read_volume
+from nlos_lit.report.fronts import View, front_views
+from nlos_lit.report.style import save_figure
 
 log = logging.getLogger(__name__)
 
@@ -38,15 +44,47 @@ SEEDS = "seeds"
 
 
 class SweepTable(Callback):
-    """Hydra callback: after a multirun, ``table.csv`` and ``table.md`` in the sweep's folder."""
+    """Hydra callback: after a multirun, its table, a picture of all runs, and their place in TensorBoard."""
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the table of all jobs that left a summary."""
+        """Write ``table.csv``, ``table.md``, ``grid.png`` and HParams of all jobs that left a summary."""
         folder = Path(config.hydra.sweep.dir)
-        rows = run_rows(sorted(path.parent for path in folder.glob("*/summary.json")))
-        if rows:
-            write_table(folder, rows)
-            log.info("the sweep's table is %s", folder / "table.md")
+        runs = told_runs(sorted(path.parent for path in folder.glob("*/summary.json")))
+        if not runs:
+            return
+        write_table(folder, rows_of(runs))
+        shown = [folder / "table.md"]
+        if write_grid(folder / "grid.png", runs):
+            shown.append(folder / "grid.png")
+        write_hparams(runs)
+        log.info("the sweep side by side: %s", ", ".join(map(str, shown)))
+
+
+@dataclass(frozen=True)
+class ToldRun:
+    """A finished run beside others.
+
+    Args:
+        folder: of the run.
+        settings: in which it differs from them, by key.
+        errors: by column of :data:`ERRORS`; None where it has none.
+    """
+
+    folder: Path
+    settings: dict[str, Any]
+    errors: dict[str, Any]
+
+
+def told_runs(folders: Sequence[Path]) -> list[ToldRun]:
+    """Runs with what tells them apart.
+
+    Raises:
+        UserError: a folder holds no finished run.
+    """
+    read = [_read(folder) for folder in folders]
+    settings = differing([dict(_settings(config)) for config, _ in read])
+    errors = [{column: _at(summary, keys) for column, keys in ERRORS.items()} for _, summary in read]
+    return [ToldRun(*told) for told in zip(folders, settings, errors, strict=True)]
 
 
 def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
@@ -63,16 +101,52 @@ def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
     Raises:
         UserError: a folder holds no finished run.
     """
-    read = [_read(folder) for folder in folders]
-    settings = differing([dict(_settings(config)) for config, _ in read])
-    errors = [{column: _at(summary, keys) for column, keys in ERRORS.items()} for _, summary in read]
-    known = [column for column in ERRORS if any(error[column] is not None for error in errors)]
-    rows = [
-        {**setting, **{column: error[column] for column in known}}
-        for setting, error in zip(settings, errors, strict=True)
-    ]
-    order = [error["MSE transient (held out)"] or error["NMSE"] or math.inf for error in errors]
+    return rows_of(told_runs(folders))
+
+
+def rows_of(runs: Sequence[ToldRun]) -> list[dict[str, Any]]:
+    """The rows of :func:`run_rows`."""
+    known = [column for column in ERRORS if any(run.errors[column] is not None for run in runs)]
+    rows = [{**run.settings, **{column: run.errors[column] for column in known}} for run in runs]
+    order = [run.errors["MSE transient (held out)"] or run.errors["NMSE"] or math.inf for run in runs]
     return [row for _, row in sorted(zip(order, rows, strict=True), key=lambda pair: -pair[0])]
+
+
+def write_grid(path: Path, runs: Sequence[ToldRun], columns: int = 4) -> bool:
+    """A picture of the volumes of all runs, each with what tells it apart.
+
+    Args:
+        path: of the picture.
+        runs: those without a ``volume.h5``, of a surface alone, are left out.
+        columns: panels in a row.
+
+    Returns:
+        Whether there was a volume to draw.
+    """
+    views = []
+    for run in runs:
+        if (run.folder / "volume.h5").is_file():
+            values, grid, _ = read_volume(run.folder / "volume.h5")
+            told = [f"{key.split('.')[-1]} {_show(value)}" for key, value in run.settings.items()]
+            views.append(View("\n".join(told) or run.folder.name, values, grid))
+    if views:
+        save_figure(front_views(views, columns), path)
+    return bool(views)
+
+
+def write_hparams(runs: Sequence[ToldRun]) -> None:
+    """Settings and errors of runs as TensorBoard's HParams, in the ``tensorboard`` of each."""
+    for run in runs:
+        settings = {
+            key: value if isinstance(value, bool | int | float | str) else str(value)
+            for key, value in run.settings.items()
+        }
+        errors = {f"sweep/{column}": float(v) for column, v in run.errors.items() if v is not None}
+        with SummaryWriter(run.folder / "tensorboard") as writer:
+            for part in hparams(settings, errors):
+                writer.file_writer.add_summary(part)
+            for name, value in errors.items():
+                writer.add_scalar(name, value)
 
 
 def differing(settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

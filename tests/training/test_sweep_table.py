@@ -5,12 +5,25 @@ from __future__ import annotations
 import csv
 import json
 
+import numpy as np
 import pytest
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
+from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.commands.compare import main as compare
+from nlos_lit.io.volumes import write_volume
 from nlos_lit.training.configs import compose
-from nlos_lit.training.sweep_table import over_seeds, run_rows, table, write_table
+from nlos_lit.training.sweep_table import (
+    over_seeds,
+    run_rows,
+    table,
+    told_runs,
+    write_grid,
+    write_hparams,
+    write_table,
+)
 
 
 def run(folder, error: float, *overrides: str, geometry: dict | None = None):
@@ -91,3 +104,26 @@ def test_any_runs_are_compared(sweep, capsys, tmp_path):
         assert sentence in capsys.readouterr().err
     assert compare(["--help"]) == 0
     assert capsys.readouterr().out.startswith("Runs side by side, where they differ")
+
+
+def test_a_sweep_is_one_picture(sweep, tmp_path):
+    runs = told_runs(folders(sweep))
+    assert not write_grid(tmp_path / "grid.png", runs)  # no run left a volume
+    grid = VolumeGrid((0.0, 0.0, 0.5), (0.1, 0.1, 0.1), (3, 4, 4))
+    for run_ in runs[:2]:
+        write_volume(run_.folder / "volume.h5", np.random.default_rng(0).random((3, 4, 4)), grid)
+    assert write_grid(tmp_path / "grid.png", runs)
+    assert (tmp_path / "grid.png").stat().st_size > 5000
+
+
+def test_a_sweep_is_shown_among_hparams(sweep):
+    runs = told_runs(folders(sweep))
+    write_hparams(runs)
+    (events,) = (runs[0].folder / "tensorboard").glob("events.*")
+    reader = EventAccumulator(str(events)).Reload()
+    assert reader.Scalars("sweep/NMSE")[0].value == pytest.approx(0.4)
+    kept = {tag: reader.SummaryMetadata(tag) for tag in reader.summary_metadata}
+    begun = HParamsPluginData.FromString(kept["_hparams_/session_start_info"].plugin_data.content)
+    told = begun.session_start_info.hparams
+    assert told["scene.threshold"].number_value == pytest.approx(0.3)
+    assert told["ablation"].string_value == "all"
