@@ -10,6 +10,7 @@ import pytest
 from conftest import ROOT
 
 from nlos_lit.commands import inspect_capture, results
+from nlos_lit.commands.nlos import COMMANDS
 from nlos_lit.places import CONF
 from nlos_lit.runtime import schema
 from nlos_lit.runtime.arguments import check_assignments, check_overrides, help_of
@@ -17,7 +18,7 @@ from nlos_lit.runtime.keys import KEYS
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
 PROGRAMS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
-START = rf"(?:\.venv/bin/)?python (?:{'|'.join(PROGRAMS)})\.py\b"
+START = rf"(?:(?:\.venv/bin/)?python (?:{'|'.join(PROGRAMS)})\.py|nlos (?:{'|'.join(COMMANDS)}))\b"
 
 
 def printed(text: str) -> list[str]:
@@ -29,13 +30,15 @@ def printed(text: str) -> list[str]:
 
 
 def sources() -> dict[str, str]:
-    files = [*PAGES, *CONF.rglob("*.yaml"), *(ROOT / f"{program}.py" for program in PROGRAMS)]
+    files = [*PAGES, *CONF.rglob("*.yaml"), ROOT / "nlos_lit/commands/nlos.py"]
+    files += [ROOT / f"{program}.py" for program in PROGRAMS]
     return {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in files}
 
 
 def reaching(commands: list[str], folder: Path) -> list[list[str]]:
     """What a shell hands to the program of each command; an unquoted pattern fails, as it does in zsh."""
     script = "shopt -s failglob\npython() { printf '%s\\0' \"$@\"; printf '\\n\\0'; }\n"
+    script += 'nlos() { python "$@"; }\n'
     script += "\n".join(command.removeprefix(".venv/bin/") for command in commands)
     done = subprocess.run(["bash", "-c", script], cwd=folder, capture_output=True, text=True, check=False)
     assert done.stderr == ""
@@ -53,7 +56,7 @@ def reaching(commands: list[str], folder: Path) -> list[list[str]]:
 def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
     monkeypatch.setattr(schema.os.path, "exists", lambda path: True)
     for program, *words in reaching(printed(sources()[name]), tmp_path):
-        command = program.removesuffix(".py")
+        command = {"inspect_capture": "inspect"}.get(program.removesuffix(".py"), program.removesuffix(".py"))
         given = [word.replace("…", "X") for word in words if not word.startswith("-")]
         if (CONF / f"{command}.yaml").exists():
             check_overrides(command, given)
@@ -61,10 +64,14 @@ def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
             check_assignments(command, given)
         elif command == "results":
             results.parse(given)
-        elif command == "inspect_capture":
+        elif command == "inspect":
             inspect_capture.parse(words)
+        elif command == "look":
+            file, *settings = given
+            assert "=" not in file
+            check_overrides("reconstruct", settings)
         else:
-            assert len(given) >= 2
+            assert len(given) == {"compare": 2, "view": 1, "completion": 1}[command]
 
 
 def test_commands_are_found():
@@ -72,6 +79,7 @@ def test_commands_are_found():
         "`python train.py scene=su`:\n\n    python simulate.py scene=letters \\\n        out=X.hdf5  # so\n"
     )
     assert printed(page) == ["python simulate.py scene=letters out=X.hdf5  # so", "python train.py scene=su"]
+    assert printed("# `nlos look FILE`, then nothing") == ["nlos look FILE"]
     assert sum(len(printed(text)) for text in sources().values()) > 60
 
 
@@ -85,6 +93,6 @@ def test_an_unquoted_list_does_not_reach_its_program(tmp_path):
 
 def test_the_readme_says_how_to_reach_the_environment():
     text = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert text.index("source .venv/bin/activate") < text.index("python train.py")
+    assert text.index("source .venv/bin/activate") < text.index("nlos look")
     for command in ("train", "simulate"):
         assert "effects=[" not in help_of(command, "").replace("'effects=[", "")

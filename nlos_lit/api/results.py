@@ -52,7 +52,7 @@ class Result(ABC):
     def save(self, folder: Path | str) -> Path:
         """Write its files into a folder, which is made, and return that."""
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         return self.sentence
 
     def show(self) -> None:

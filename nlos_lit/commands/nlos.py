@@ -36,7 +36,7 @@ class Command:
     @property
     def about(self) -> str:
         """The first lines of its ``--help``."""
-        return f"{self.does[0].upper()}{self.does[1:]}." + (f"\n\n{self.more}" if self.more else "")
+        return f"{self.does[0].upper()}{self.does[1:]}." + (f"\n\n{self.more.rstrip()}" if self.more else "")
 
 
 SIMULATE = """\
@@ -45,7 +45,8 @@ wall, and the mesh. A scene of one's own: 'bodies=[{kind: cone, at: [0, 0, 0.6]}
 random=7 (docs/simulator.md). With physical effects, each with strengths as EFFECT.PARAMETER=VALUE
 (docs/effects.md):
 
-    nlos simulate scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5"""
+    nlos simulate scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5
+"""
 RESULTS = """\
 Names are experiments, all, or page, which rewrites the generated parts of docs/results.md from what is
 stored.
