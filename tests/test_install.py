@@ -124,3 +124,24 @@ def test_the_program_starts_at_once():
     loaded = set(python("-c", code, cwd=ROOT).split())
     assert time.perf_counter() - began < 1
     assert not loaded & {"numpy", "torch", "hydra", "omegaconf", "lightning", "matplotlib", "h5py", "scipy"}
+
+
+@pytest.mark.slow
+def test_a_fresh_environment_takes_wheel_and_source(dist, tmp_path):
+    """As a user installs it, dependencies from the package index included, up to a picture of a capture."""
+    python("-m", "venv", "fresh", cwd=tmp_path)
+    place = tmp_path / "fresh" / "bin"
+    pinned = ["install", "--quiet", "--constraint", str(ROOT / "constraints.txt")]
+    (wheel,), (archive,) = dist.glob("*.whl"), dist.glob("*.tar.gz")
+    done = subprocess.run([place / "pip", *pinned, str(wheel)], capture_output=True, text=True, check=False)
+    if done.returncode and "No matching distribution" in done.stderr:
+        pytest.skip("the package index cannot be reached")
+    assert done.returncode == 0, done.stderr
+    simulate = ["simulate", "scene=letters", "nx=32", "ny=32", "overwrite=true", "out=mine.hdf5"]
+    for again in ([], [place / "pip", *pinned, "--no-deps", "--force-reinstall", str(archive)]):
+        if again:
+            subprocess.run(again, check=True)
+        for words in (["--version"], simulate, ["look", "mine.hdf5"]):
+            subprocess.run([place / "nlos", *words], cwd=tmp_path, check=True)
+        assert (tmp_path / "outputs" / "mine" / "look" / "look.png").exists()
+        shutil.rmtree(tmp_path / "outputs")

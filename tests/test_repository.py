@@ -44,6 +44,7 @@ MAY_IMPORT = {
 MAY_IMPORT["api"] = set(MAY_IMPORT) - {"paper"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"commands"}
+PINNED_EXTRAS = ("dev", "sweep", "optuna", "notebooks")
 DOORS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
 
 
@@ -273,7 +274,8 @@ def test_every_declared_dependency_is_pinned():
     assert all(re.fullmatch(r"==[^*]+", str(pin.specifier)) for pin in pins)
     versions = {canonicalize_name(pin.name): str(pin.specifier)[2:] for pin in pins}
     assert len(versions) == len(pins)
-    for text in project["dependencies"] + project["optional-dependencies"]["dev"]:
+    extras = [text for name in PINNED_EXTRAS for text in project["optional-dependencies"][name]]
+    for text in project["dependencies"] + extras:
         wanted = Requirement(text)
         assert versions[canonicalize_name(wanted.name)] in wanted.specifier, text
 
