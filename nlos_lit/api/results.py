@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import os
 import sys
 import tempfile
 import webbrowser
@@ -32,6 +33,7 @@ from nlos_lit.surfels.fitted import FittedSurfels
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+os.environ.setdefault("OPEN3D_DISABLE_WEB_VISUALIZER", "true")  # which it would announce in a notebook
 DOTS = 80  # an inch, of figures in a notebook
 OCTREE = 7  # depth of the Poisson reconstruction
 
