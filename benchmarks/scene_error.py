@@ -95,12 +95,12 @@ def gain_over_truth(fit, expected: np.ndarray, spots: np.ndarray) -> float:
 def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
     """Print one development capture's rows."""
     from blind_judge import pipeline_for
+    from surface import changed
     from wild_truth import make
 
     from data_modules.readers import read_capture
     from nlos_lit.inference.heldout import score
     from nlos_lit.inference.split import split_spots
-    from surface import changed
 
     with tempfile.TemporaryDirectory() as folder:
         truth = make("development", number, Path(folder) / "capture.hdf5")
