@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 from conftest import ROOT
 
-from nlos_lit.commands import inspect_capture, results
+from nlos_lit.commands import inspect_capture, results, view
 from nlos_lit.runtime import schema
 from nlos_lit.runtime.arguments import CONF, check_assignments, check_overrides, help_of
 from nlos_lit.runtime.keys import KEYS
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
-PROGRAMS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
+PROGRAMS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare", "view")
 START = rf"(?:\.venv/bin/)?python (?:{'|'.join(PROGRAMS)})\.py\b"
 
 
@@ -62,6 +62,8 @@ def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
             results.parse(given)
         elif command == "inspect_capture":
             inspect_capture.parse(words)
+        elif command == "view":
+            view.parse(words)
         else:
             assert len(given) >= 2
 

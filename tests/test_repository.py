@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "data_modules": LOW,
 }
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
-DOORS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
+DOORS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare", "view")
 
 
 def _tracked() -> list[str]:

@@ -1,0 +1,74 @@
+"""A diagnosis to look at, while it goes on and when it has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from nlos_lit.capture import Capture
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.inference.criticise import Findings, Turn
+from nlos_lit.inference.result import Diagnosis
+from nlos_lit.io.files import plain
+from nlos_lit.report.advice import confidence, next_step, told_turn
+from nlos_lit.report.verdict import tone, verdict
+from nlos_lit.surfels.fit import SurfelFit
+from nlos_lit.training.explored import Expected, Scene, facts_of, keep, view_of
+
+
+class WatchedDiagnosis:
+    """Keeps ``view.npz`` and ``explore.html`` of a diagnosis up to date.
+
+    Args:
+        folder: of the diagnosis.
+        name: of the capture.
+        capture: that is diagnosed.
+    """
+
+    def __init__(self, folder: Path, name: str, capture: Capture) -> None:
+        self.folder, self.name, self.capture = folder, name, capture
+        self.image: tuple[Tensor, VolumeGrid] | None = None
+
+    def turn(
+        self, image: tuple[Tensor, VolumeGrid], base: SurfelFit, present: SurfelFit, turns: Sequence[Turn]
+    ) -> None:
+        """Show what was found so far.
+
+        Args:
+            image: ``[nz, nx, ny]`` and its grid.
+            base: fine fit without effects.
+            present: fine fit with what was accepted.
+            turns: that have ended.
+        """
+        self.image = image
+        said = [f"Diagnosis after {len(turns)} turn{'s' * (len(turns) != 1)}: still asking what is missing."]
+        said += [told_turn(k, turn) for k, turn in enumerate(turns, 1)]
+        self._keep(base, present, "running", said)
+
+    def finish(self, found: Findings, diagnosis: Diagnosis) -> None:
+        """Show the result.
+
+        Args:
+            found: the fits.
+            diagnosis: what is said of them.
+        """
+        said = [verdict(diagnosis), confidence(diagnosis), f"Do this next: {next_step(diagnosis).text}"]
+        more = {"tone": tone(diagnosis), "profiles": plain(diagnosis.profiles), "report": True}
+        self._keep(found.base, found.final, "finished", said, **more)
+
+    def _keep(self, base: SurfelFit, present: SurfelFit, status: str, said: list[str], **more: Any) -> None:
+        models, clouds = {"rendered": _expected(base)}, {"surfels": base.model.points()}
+        names = ", ".join(effect.name for effect in present.extension.effects)
+        if names:
+            models[f"extended by {names}"] = _expected(present)
+            clouds = {"surfels before": clouds["surfels"], "surfels after": present.model.points()}
+        volume = None if self.image is None else (self.image[0].cpu().numpy(), self.image[1])
+        facts = facts_of(self.name, self.capture, status, said, **more)
+        keep(self.folder, view_of(self.capture, models, Scene(clouds, volume=volume), facts))
+
+
+def _expected(fit: SurfelFit) -> Expected:
+    return lambda spots: fit.model.expected(spots, fit.extension)
