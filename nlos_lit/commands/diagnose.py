@@ -82,7 +82,7 @@ def diagnose(config: DictConfig) -> None:
         "model": model,
         **{key: settings[key] for key in ("surfels", "criticism", "seed")},
     }
-    watched = WatchedDiagnosis(folder / "diagnosis", scene["name"], capture)
+    watched = WatchedDiagnosis(folder / "diagnosis", scene, capture)
     try:
         with StepTicker("diagnosis") as ticker:
             diagnosis, found = diagnose_capture(
@@ -101,8 +101,9 @@ def diagnose(config: DictConfig) -> None:
         mark_interrupted(folder / "diagnosis")
         log.warning("interrupted; the same command with hydra.run.dir=%s goes on where it was", folder)
         sys.exit(130)
-    watched.finish(found, diagnosis)
-    page = write_report(diagnosis, folder / "diagnosis", scene=scene_settings(config, folder))
+    given = scene_settings(config, folder)
+    watched.finish(found, diagnosis, given)
+    page = write_report(diagnosis, folder / "diagnosis", scene=given)
     shutil.rmtree(folder / "diagnosis" / "steps")
     log_figures(folder, diagnosis_figures(diagnosis))
     log.info("%s", verdict(diagnosis))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -145,7 +146,8 @@ def read_view(folder: Path | str) -> View:
     """
     file = Path(folder) / FILE
     try:
-        with np.load(file, allow_pickle=False) as kept:
+        content = io.BytesIO(file.read_bytes())  # NumPy leaves a damaged file open
+        with np.load(content, allow_pickle=False) as kept:
             header = json.loads(str(kept["header"]))
             arrays = {name: kept[name] for name in kept.files if name != "header"}
         return _unpacked(header, arrays)
@@ -154,7 +156,15 @@ def read_view(folder: Path | str) -> View:
             f"{folder} holds no {FILE}: it is no run's folder, or the run is of an earlier version; "
             "give the folder that a train or diagnose command has named at its end"
         ) from error
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         raise UserError(f"{file} is damaged: {error}") from error
 
 

@@ -131,23 +131,26 @@
     add("scanned wall", true, { type: "scatter3d", mode: "lines", x: [x0, x1, x1, x0, x0], y: [y0, y0, y1, y1, y0],
       z: [0, 0, 0, 0, 0], line: { color: "#0072B2", width: 4 }, hoverinfo: "skip" });
     const axis = (title) => ({ title: { text: title }, backgroundcolor: "#f4f4f4", showbackground: true, gridcolor: "#cfcfcf" });
-    Plotly.newPlot("scene", traces, { ...base, margin: { l: 0, r: 0, t: 0, b: 0 }, scene: { aspectmode: "data", dragmode: "orbit",
+    Plotly.newPlot("hidden", traces, { ...base, dragmode: "orbit", margin: { l: 0, r: 0, t: 0, b: 0 }, scene: { aspectmode: "data", dragmode: "orbit",
       xaxis: axis("x (m)"), yaxis: axis("y (m)"), zaxis: axis("z, depth (m)"),
-      camera: state.camera || { eye: { x: 0.6, y: 0.6, z: -2.1 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } } }, config);
-    at("scene").on("plotly_relayout", () => { state.camera = at("scene")._fullLayout.scene.camera; remember(); });
+      camera: state.camera || { eye: { x: 0.45, y: 0.4, z: -1.95 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } } }, config);
+    for (const event of ["pointerup", "wheel", "touchend", "click"])
+      at("hidden").addEventListener(event, () => setTimeout(() => { state.camera = camera(); remember(); }, 300), { passive: true });
     for (const { name, index } of shown3d) {
       const label = document.createElement("label"), box = document.createElement("input");
       box.type = "checkbox"; box.checked = traces[index].visible; box.dataset.trace = name;
-      box.addEventListener("change", () => Plotly.restyle("scene", { visible: box.checked }, [index]));
+      box.addEventListener("change", () => Plotly.restyle("hidden", { visible: box.checked }, [index]));
       label.append(box, " " + name);
       at("layers").append(label);
     }
   }
+  /* As it is: after a turn by button, plotly's layout does not follow turns by hand. */
+  function camera() { return at("hidden")._fullLayout.scene._scene.getCamera(); }
   function look(eye) {
-    Plotly.relayout("scene", { "scene.camera": { eye, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } });
+    Plotly.relayout("hidden", { "scene.camera": { eye, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } });
   }
   function turn(angle) {
-    const { x, y, z } = at("scene")._fullLayout.scene.camera.eye, c = Math.cos(angle), s = Math.sin(angle);
+    const { x, y, z } = camera().eye, c = Math.cos(angle), s = Math.sin(angle);
     look({ x: c * x + s * z, y, z: c * z - s * x });
   }
 
@@ -167,8 +170,8 @@
       z: range(n[up]).map((b) => range(n[across]).map((a) => value(a, b))), zmin: 0, zmax: header.grid.largest, colorscale: INFERNO,
       colorbar: { title: { text: "intensity", side: "right" }, thickness: 12 },
       hovertemplate: `${across} %{x:.3f}, ${up} %{y:.3f} m<br>%{z:.3g}<extra></extra>` }],
-    { ...base, xaxis: { title: { text: `${across} (m)` }, autorange: across === "x" ? "reversed" : true, constrain: "domain" },
-      yaxis: { title: { text: `${up} (m)` }, scaleanchor: "x", constrain: "domain" } }, config);
+    { ...base, xaxis: { title: { text: `${across} (m)` }, autorange: across === "x" ? "reversed" : true, constrain: "domain", zeroline: false },
+      yaxis: { title: { text: `${up} (m)` }, scaleanchor: "x", constrain: "domain", zeroline: false } }, config);
   }
   function brightest(axis) {
     let best = 0, where = 0;
@@ -194,8 +197,8 @@
       colorbar: { title: { text: isResidual ? `residual (${unit})` : "counts", side: "right" }, thickness: 12 },
       hovertemplate: "x %{x:.3f}, y %{y:.3f} m<br>%{z:.4g}<extra></extra>" };
   }
-  const wallLayout = { ...base, xaxis: { title: { text: "x (m), as seen from the wall" }, autorange: "reversed", constrain: "domain" },
-    yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain" } };
+  const wallLayout = { ...base, xaxis: { title: { text: "x (m), as seen from the wall" }, autorange: "reversed", constrain: "domain", zeroline: false },
+    yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain", zeroline: false } };
   function wall() {
     const [from, to] = window_();
     const text = state.bin < 0 ? "all bins together"
@@ -264,9 +267,9 @@
       const map = (values, k) => ({ type: "heatmap", x: centre(p.edges), y: centre(p.edges_y), z: centre(p.edges_y).map((_, j) => values.map((r) => r[j])),
         zmin: -limit, zmax: limit, colorscale: SIGNED, xaxis: k ? "x2" : "x", yaxis: k ? "y2" : "y", showscale: k === 1,
         colorbar: { title: { text: "residual (σ)", side: "right" }, thickness: 12 }, hovertemplate: "%{z:.2f} σ<extra></extra>" });
-      const x = (k) => ({ title: { text: `${k ? "after" : "before"}, x (m)` }, autorange: "reversed", domain: k ? [0.54, 1] : [0, 0.46], constrain: "domain", anchor: k ? "y2" : "y" });
+      const x = (k) => ({ title: { text: `${k ? "after" : "before"}, x (m)` }, autorange: "reversed", domain: k ? [0.54, 1] : [0, 0.46], constrain: "domain", zeroline: false, anchor: k ? "y2" : "y" });
       return Plotly.react("change", [map(p.before, 0), map(p.after, 1)], { ...base, xaxis: x(0), xaxis2: x(1),
-        yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain" }, yaxis2: { scaleanchor: "x2", constrain: "domain", anchor: "x2" } }, config);
+        yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain", zeroline: false }, yaxis2: { scaleanchor: "x2", constrain: "domain", zeroline: false, anchor: "x2" } }, config);
     }
     const line = (name, values, color, k) => ({ type: "scatter", mode: "lines", name, x: p.edges.slice(0, -1).map((e, i) => (e + p.edges[i + 1]) / 2),
       y: values, line: { color, width: 2 - 0.4 * k, shape: "hvh" } });
@@ -284,7 +287,7 @@
   if (header.grid) {
     at("level").value = state.level;
     on("level", "change", (e) => { state.level = Number(e.target.value); remember();
-      Plotly.restyle("scene", { isomin: state.level / 100 }, [0]); });
+      Plotly.restyle("hidden", { isomin: state.level / 100 }, [0]); });
     at("axis").value = state.axis;
     on("axis", "change", (e) => { state.axis = e.target.value; state.slice = -1; slice(); remember(); });
     on("slice", "input", (e) => { state.slice = Number(e.target.value); slice(); remember(); });

@@ -81,8 +81,8 @@ def page_html(view: View) -> str:
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{name}: explore</title><style>{style}</style></head>
 <body>
-{_top(view)}
 <main>
+{_top(view)}
 <div class="grid">
 {_scene(view)}
 {_slices(view)}
@@ -153,8 +153,16 @@ def _top(view: View) -> str:
         else ""
     )
     report = '<p><a href="report.html">The whole report</a></p>' if facts.get("report") else ""
+    advice = facts.get("next")
+    command = f"<pre tabindex=0><code>{html.escape(advice['command'])}</code></pre>" if advice else ""
+    after = (
+        f'<div class="next"><h2>Do this next</h2><p>{html.escape(advice["text"])}</p>'
+        f"{command if advice['command'] else ''}</div>"
+        if advice
+        else ""
+    )
     return (
-        f'<header><p class="over">{html.escape(str(facts["name"]))}</p>{first}{rest}'
+        f'<header><p class="over">{html.escape(str(facts["name"]))}</p>{first}{rest}{after}'
         f'<p><span class="status">{STATUS[facts["status"]]} {html.escape(facts["at"])}</span></p>'
         f'{live}{report}<p id="message" role="status"></p>'
         "<noscript><p>This page draws with JavaScript; it is switched off here.</p></noscript></header>"
@@ -179,7 +187,7 @@ def _scene(view: View) -> str:
     what = f"Hidden scene in three dimensions: {', '.join(names) or 'nothing yet'}. Buttons below turn it."
     return _section(
         "The hidden scene",
-        f'<div class="plot" id="scene" role="img" aria-label="{html.escape(what)}"></div>'
+        f'<div class="plot" id="hidden" role="group" aria-label="{html.escape(what)}"></div>'
         f'<div class="controls" id="layers"></div><div class="controls">{looks}{turns}</div>'
         f'<div class="controls">{level}</div>',
     )
@@ -190,7 +198,7 @@ def _slices(view: View) -> str:
         return _section("Slices", "<p>No volume has been made yet.</p>")
     return _section(
         "Slices of the volume",
-        '<div class="plot" id="slices" role="img" aria-label="A slice through the volume; choose it below.">'
+        '<div class="plot" id="slices" role="group" aria-label="A slice of the volume, chosen below.">'
         '</div><div class="controls"><label>across <select id="axis"><option value="z">depth z</option>'
         '<option value="x">x</option><option value="y">y</option></select></label>'
         '<label>place <input type="range" id="slice" min="0"></label>'
@@ -217,8 +225,8 @@ def _wall(view: View) -> str:
 def _spot(view: View) -> str:
     return _section(
         "One spot",
-        '<div class="plot" id="transient" role="img" aria-label="Transient of the chosen spot: measured and '
-        'modelled counts over optical path, residual below. The table gives the numbers."></div>'
+        '<div class="plot" id="transient" role="group" aria-label="Transient of the chosen spot: measured '
+        'and modelled counts over optical path, residual below. The table gives the numbers."></div>'
         '<div class="controls"><label>spot shown <input type="number" id="spot" min="0"></label></div>'
         '<p id="where" aria-live="polite"></p>'
         '<table><thead><tr><th scope="col">Counts</th><th scope="col">number</th>'
@@ -237,8 +245,8 @@ def _change(view: View) -> str:
         "Before and after the diagnosis",
         "<p>How many standard deviations the counts lie above the simulation: as it was, and with what the "
         "diagnosis added. Within the grey band lies chance.</p>"
-        '<div class="plot" id="change" role="img" aria-label="Residual before and after the extension along '
-        'the chosen axis."></div>'
+        '<div class="plot" id="change" role="group" aria-label="Residual before and after the extension '
+        'along the chosen axis."></div>'
         f'<div class="controls"><label>residual <select id="profile">{options}</select></label></div>',
     )
 
@@ -247,6 +255,7 @@ def _provenance(view: View) -> str:
     origin = view.facts.get("origin", {})
     rows = {
         "command": origin.get("command"),
+        "file": origin.get("file"),
         **{f"capture {k}": v for k, v in origin.get("capture", {}).items()},
     }
     provenance = origin.get("provenance") or {}
@@ -264,7 +273,7 @@ def _provenance(view: View) -> str:
     )
     more = {k: v for k, v in provenance.items() if isinstance(v, (dict, list)) and v}
     whole = (
-        f"<details><summary>All that is known of the file</summary><pre>"
+        f"<details><summary>All that is known of the file</summary><pre tabindex=0>"
         f"{html.escape(json.dumps(more, indent=1, ensure_ascii=False))}</pre></details>"
         if more
         else ""

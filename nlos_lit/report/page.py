@@ -149,7 +149,7 @@ def report_html(
     each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
     known: set[str] = set()
     advice = next_step(diagnosis, scene)
-    command = f"<pre><code>{_text(advice.command)}</code></pre>" if advice.command else ""
+    command = f"<pre tabindex=0><code>{_text(advice.command)}</code></pre>" if advice.command else ""
     link = '<p><a href="explore.html">Explore scene, wall and transients</a></p>' if explorable else ""
     parts = [
         f'<header><p class="over">Diagnosis of {_text(name)}</p>'
@@ -188,9 +188,9 @@ def report_html(
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     title = f"<title>Diagnosis of {_text(name)}</title><style>{CSS}</style>"
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}{title}</head>\n<body>\n'
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}{title}</head>\n<body><main>\n'
         + "\n".join(filter(None, parts))
-        + "\n</body></html>\n"
+        + "\n</main></body></html>\n"
     )
 
 
@@ -428,7 +428,7 @@ def _table(heads: list[str], rows: Iterable[list[Any]], style: str = "") -> str:
         for row in rows
     )
     return (
-        f'<div class="wide"><table class="{style}"><thead><tr>{top}</tr></thead><tbody><tr>'
+        f'<div class="wide" tabindex="0"><table class="{style}"><thead><tr>{top}</tr></thead><tbody><tr>'
         + "</tr><tr>".join(lines)
         + "</tr></tbody></table></div>"
     )

@@ -13,7 +13,8 @@ ol { padding-left: 1.6rem; } li { margin: .2rem 0; } header li { font-size: 1.1r
 h2 { margin: 2.2rem 0 .6rem; font-size: 1.1rem; border-bottom: 1px solid var(--line); }
 small, figcaption, .over { color: var(--soft); font-size: .85rem; }
 .over { margin: 0; }
-header h2 { margin: 1rem 0 .2rem; border: 0; font-size: 1.02rem; } header h2 + p { margin-top: 0; }
+.next h2, header h2 { margin: 1rem 0 .2rem; border: 0; font-size: 1.02rem; }
+.next h2 + p, header h2 + p { margin-top: 0; }
 .next { border: 1px solid #0072B2; border-radius: .3rem; padding: .1rem 1rem .4rem; background: #f3f8fc; }
 .next pre { overflow-x: auto; background: #fff; border: 1px solid var(--line); padding: .4rem .6rem; }
 a { color: #005b8f; }

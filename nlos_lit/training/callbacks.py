@@ -238,7 +238,9 @@ class Explore(L.Callback):
             folder = Path(trainer.default_root_dir)
             folder = folder.parent if folder.name == "refined" else folder
             models, scene = module.explored()
-            name = module.origin.get("settings", {}).get("scene.name", "capture")
+            kept = module.origin.get("settings", {})
+            settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
+            facts = facts_of(settings, capture, "running", [said])
             spots = SPOTS if scene.volume is None else LIVE_SPOTS
-            keep(folder, view_of(capture, models, scene, facts_of(name, capture, "running", [said]), spots))
+            keep(folder, view_of(capture, models, scene, facts, spots))
         module.release()

@@ -103,11 +103,13 @@ def view_of(
     )
 
 
-def facts_of(name: str, capture: Capture, status: str, said: Sequence[str], **more: Any) -> dict[str, Any]:
+def facts_of(
+    scene: Mapping[str, Any], capture: Capture, status: str, said: Sequence[str], **more: Any
+) -> dict[str, Any]:
     """What a page says besides arrays: what was found, and where it came from.
 
     Args:
-        name: of the capture.
+        scene: its settings.
         capture: the measurement.
         status: running, interrupted or finished.
         said: sentences on what was found so far.
@@ -118,6 +120,7 @@ def facts_of(name: str, capture: Capture, status: str, said: Sequence[str], **mo
     """
     now = datetime.datetime.now().astimezone()
     origin = {
+        "file": scene.get("path") or (scene.get("source") or {}).get("file"),
         "command": shlex.join(["python", Path(sys.argv[0]).name, *sys.argv[1:]]),
         "capture": {"spots": capture.n_spots, "bins": capture.n_bins, "sha256": capture.digest()},
         "provenance": capture.provenance,
@@ -125,7 +128,7 @@ def facts_of(name: str, capture: Capture, status: str, said: Sequence[str], **mo
         "versions": versions(),
     }
     return {
-        "name": name, "status": status, "at": now.isoformat(timespec="seconds"),
+        "name": scene["name"], "status": status, "at": now.isoformat(timespec="seconds"),
         "said": list(said), "origin": origin, **more,
     }  # fmt: skip
 

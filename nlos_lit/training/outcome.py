@@ -216,7 +216,7 @@ def explore_results(run: Run, folder: Path, summary: dict[str, Any], surface: Su
             run.capture,
             models,
             Scene(clouds, kept_mesh(mesh), (volume, phasor.grid)),
-            facts_of(run.config["scene"]["name"], run.capture, "finished", said),
+            facts_of(run.config["scene"], run.capture, "finished", said),
             RAYED_SPOTS if surface is None else SPOTS,
         ),
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,12 @@ class WatchedDiagnosis:
 
     Args:
         folder: of the diagnosis.
-        name: of the capture.
+        scene: settings of the scene.
         capture: that is diagnosed.
     """
 
-    def __init__(self, folder: Path, name: str, capture: Capture) -> None:
-        self.folder, self.name, self.capture = folder, name, capture
+    def __init__(self, folder: Path, scene: Mapping[str, Any], capture: Capture) -> None:
+        self.folder, self.scene, self.capture = folder, scene, capture
         self.image: tuple[Tensor, VolumeGrid] | None = None
 
     def turn(
@@ -48,15 +48,17 @@ class WatchedDiagnosis:
         said += [told_turn(k, turn) for k, turn in enumerate(turns, 1)]
         self._keep(base, present, "running", said)
 
-    def finish(self, found: Findings, diagnosis: Diagnosis) -> None:
+    def finish(self, found: Findings, diagnosis: Diagnosis, given: Sequence[str] = ()) -> None:
         """Show the result.
 
         Args:
             found: the fits.
             diagnosis: what is said of them.
+            given: settings of the command line that name the scene.
         """
-        said = [verdict(diagnosis), confidence(diagnosis), f"Do this next: {next_step(diagnosis).text}"]
+        said = [verdict(diagnosis), confidence(diagnosis)]
         more = {"tone": tone(diagnosis), "profiles": plain(diagnosis.profiles), "report": True}
+        more["next"] = plain(next_step(diagnosis, given))
         self._keep(found.base, found.final, "finished", said, **more)
 
     def _keep(self, base: SurfelFit, present: SurfelFit, status: str, said: list[str], **more: Any) -> None:
@@ -66,7 +68,7 @@ class WatchedDiagnosis:
             models[f"extended by {names}"] = _expected(present)
             clouds = {"surfels before": clouds["surfels"], "surfels after": present.model.points()}
         volume = None if self.image is None else (self.image[0].cpu().numpy(), self.image[1])
-        facts = facts_of(self.name, self.capture, status, said, **more)
+        facts = facts_of(self.scene, self.capture, status, said, **more)
         keep(self.folder, view_of(self.capture, models, Scene(clouds, volume=volume), facts))
 
 
