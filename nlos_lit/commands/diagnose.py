@@ -84,6 +84,7 @@ def diagnose(config: DictConfig) -> None:
     }
     watched = WatchedDiagnosis(folder / "diagnosis", scene, capture)
     try:
+        watched.begin()
         with StepTicker("diagnosis") as ticker:
             diagnosis, found = diagnose_capture(
                 capture,

@@ -267,9 +267,11 @@
       const map = (values, k) => ({ type: "heatmap", x: centre(p.edges), y: centre(p.edges_y), z: centre(p.edges_y).map((_, j) => values.map((r) => r[j])),
         zmin: -limit, zmax: limit, colorscale: SIGNED, xaxis: k ? "x2" : "x", yaxis: k ? "y2" : "y", showscale: k === 1,
         colorbar: { title: { text: "residual (σ)", side: "right" }, thickness: 12 }, hovertemplate: "%{z:.2f} σ<extra></extra>" });
-      const x = (k) => ({ title: { text: `${k ? "after" : "before"}, x (m)` }, autorange: "reversed", domain: k ? [0.54, 1] : [0, 0.46], constrain: "domain", zeroline: false, anchor: k ? "y2" : "y" });
+      const narrow = at("change").clientWidth < 600, half = (k) => (k ? [0.54, 1] : [0, 0.46]);
+      const x = (k) => ({ title: { text: `${k ? "after" : "before"}, x (m)` }, autorange: "reversed", domain: narrow ? [0, 1] : half(k), constrain: "domain", zeroline: false, anchor: k ? "y2" : "y" });
       return Plotly.react("change", [map(p.before, 0), map(p.after, 1)], { ...base, xaxis: x(0), xaxis2: x(1),
-        yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain", zeroline: false }, yaxis2: { scaleanchor: "x2", constrain: "domain", zeroline: false, anchor: "x2" } }, config);
+        yaxis: { title: { text: "y (m)" }, scaleanchor: "x", constrain: "domain", zeroline: false, domain: narrow ? half(1) : [0, 1] },
+        yaxis2: { scaleanchor: "x2", constrain: "domain", zeroline: false, anchor: "x2", domain: narrow ? half(0) : [0, 1] } }, config);
     }
     const line = (name, values, color, k) => ({ type: "scatter", mode: "lines", name, x: p.edges.slice(0, -1).map((e, i) => (e + p.edges[i + 1]) / 2),
       y: values, line: { color, width: 2 - 0.4 * k, shape: "hvh" } });

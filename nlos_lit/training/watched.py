@@ -32,6 +32,11 @@ class WatchedDiagnosis:
         self.folder, self.scene, self.capture = folder, scene, capture
         self.image: tuple[Tensor, VolumeGrid] | None = None
 
+    def begin(self) -> None:
+        """Show what was measured; nothing is fitted yet."""
+        facts = facts_of(self.scene, self.capture, "running", ["Diagnosis: fitting the simulation first."])
+        keep(self.folder, view_of(self.capture, {}, Scene(), facts))
+
     def turn(
         self, image: tuple[Tensor, VolumeGrid], base: SurfelFit, present: SurfelFit, turns: Sequence[Turn]
     ) -> None:
