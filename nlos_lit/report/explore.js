@@ -6,7 +6,7 @@
   const header = JSON.parse(at("header").textContent);
   const facts = header.facts;
   const INFERNO = ["#000004", "#420a68", "#932667", "#dd513a", "#fca50a", "#fcffa4"].map((c, k) => [k / 5, c]);
-  const SIGNED = ["#2d004b", "#8073ac", "#f7f7f7", "#e08214", "#7f3b08"].map((c, k) => [k / 4, c]);
+  const SIGNED = ["#7f3b08", "#e08214", "#f7f7f7", "#8073ac", "#2d004b"].map((c, k) => [k / 4, c]);
   const COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7"];
 
   async function unpacked(id) {

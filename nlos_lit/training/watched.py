@@ -49,7 +49,7 @@ class WatchedDiagnosis:
             turns: that have ended.
         """
         self.image = image
-        said = [f"Diagnosis after {len(turns)} turn{'s' * (len(turns) != 1)}: still asking what is missing."]
+        said = ["The diagnosis goes on: asking what the simulation misses."]
         said += [told_turn(k, turn) for k, turn in enumerate(turns, 1)]
         self._keep(base, present, "running", said)
 
