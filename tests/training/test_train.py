@@ -86,11 +86,11 @@ def test_a_run_leaves_a_page_to_explore(finished):
     assert view.facts["status"] == "finished"
     assert "train.py" in view.facts["origin"]["command"]
     np.testing.assert_array_equal(view.counts, capture.gated_counts()[view.spots])
-    assert list(view.models) == ["rendered", "extended by wall_reflectance, irf_tail"]
+    assert list(view.models) == ["rendered", "extended by irf_tail, wall_reflectance"]
     model, extension = load_refined(finished, capture)
     with torch.no_grad():
         expected = model.expected(torch.from_numpy(view.spots[:5]), extension).numpy()
-    np.testing.assert_allclose(view.models["extended by wall_reflectance, irf_tail"][:5], expected, atol=0.05)
+    np.testing.assert_allclose(view.models["extended by irf_tail, wall_reflectance"][:5], expected, atol=0.05)
     assert len(view.clouds["surfels"]) == len(read_points(finished / "refined" / "points.ply"))
     page = (finished / "explore.html").read_text(encoding="utf-8")
     assert "finished at" in page
