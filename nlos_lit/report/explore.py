@@ -161,9 +161,10 @@ def _top(view: View) -> str:
         if advice
         else ""
     )
+    when = str(facts["at"]).replace("T", " ")
     return (
         f'<header><p class="over">{html.escape(str(facts["name"]))}</p>{first}{rest}{after}'
-        f'<p><span class="status">{STATUS[facts["status"]]} {html.escape(facts["at"].replace("T", " "))}</span></p>'
+        f'<p><span class="status">{STATUS[facts["status"]]} {html.escape(when)}</span></p>'
         f'{live}{report}<p id="message" role="status"></p>'
         "<noscript><p>This page draws with JavaScript; it is switched off here.</p></noscript></header>"
     )
