@@ -7,7 +7,7 @@ VENV ?= .venv
 ARGS ?=
 STAMP := $(VENV)/.installed
 
-.PHONY: run test slow lint types clean setup results tal
+.PHONY: run test slow lint types clean setup results docs tal
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
@@ -29,6 +29,11 @@ types: $(STAMP)
 results: $(STAMP)
 	$(VENV)/bin/python results.py page $(ARGS)
 
+# The documentation as a site, into site/; fails where a link leads nowhere.
+docs: $(STAMP)
+	$(VENV)/bin/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(VENV)/bin/python -m mkdocs build --strict
+
 # y-tal for tests/baselines/test_baseline_tal.py
 tal: .venv-tal/.installed
 .venv-tal/.installed: scripts/requirements-tal.txt
@@ -43,4 +48,4 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-tal build *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(VENV) .venv-tal build site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -45,7 +45,7 @@ MAY_IMPORT["api"] = set(MAY_IMPORT) - {"paper"}
 MAY_IMPORT["commands"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"commands"}
 PINNED_EXTRAS = ("dev", "sweep", "optuna", "notebooks")
-DOORS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare")
+DOORS = ("train", "diagnose", "reconstruct", "simulate", "results", "inspect_capture", "compare", "view")
 
 
 def _tracked() -> list[str]:

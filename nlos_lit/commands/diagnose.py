@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import torch
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from data_modules.load import load_scene
@@ -29,8 +30,10 @@ from nlos_lit.runtime.progress import StepTicker
 from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.configs import register_settings, settings_of
-from nlos_lit.training.folder import resolved, take_folder, take_given_folder, write_config
+from nlos_lit.training.explored import mark_interrupted
+from nlos_lit.training.folder import begun_with, resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.run_folder import Run, open_run
+from nlos_lit.training.watched import WatchedDiagnosis
 
 log = logging.getLogger(__name__)
 
@@ -85,9 +88,11 @@ def diagnose(config: DictConfig) -> None:
         "model": model,
         **{key: settings[key] for key in ("surfels", "criticism", "seed")},
     }
+    watched = WatchedDiagnosis(folder / "diagnosis", scene, capture)
     try:
+        watched.begin()
         with StepTicker("diagnosis") as ticker:
-            diagnosis, _ = diagnose_capture(
+            diagnosis, found = diagnose_capture(
                 capture,
                 pipeline,
                 options,
@@ -97,15 +102,33 @@ def diagnose(config: DictConfig) -> None:
                 folder=folder / "diagnosis",
                 settings=json.dumps(kept, indent=1, default=str),
                 report=ticker.step,
+                told=watched.turn,
             )
     except KeyboardInterrupt:
+        mark_interrupted(folder / "diagnosis")
         log.warning("interrupted; the same command with hydra.run.dir=%s goes on where it was", folder)
         sys.exit(130)
-    page = write_report(diagnosis, folder / "diagnosis")
+    given = scene_settings(config, folder)
+    watched.finish(found, diagnosis, given)
+    page = write_report(diagnosis, folder / "diagnosis", scene=given)
     shutil.rmtree(folder / "diagnosis" / "steps")
     log_figures(folder, diagnosis_figures(diagnosis))
     log.info("%s", verdict(diagnosis))
     log.info("%.0f s; %s", time.perf_counter() - began, page)
+
+
+def scene_settings(config: DictConfig, folder: Path) -> list[str]:
+    """What of a command line names the scene, to be given again.
+
+    Args:
+        config: of the diagnosis.
+        folder: of the run.
+
+    Returns:
+        settings of ``train.py``.
+    """
+    given = HydraConfig.get().overrides.task if config.run is None else begun_with(folder)
+    return [item for item in given if item.startswith(("scene=", "scene."))]
 
 
 def _undiagnosed(folder: Path) -> Run:

@@ -30,6 +30,7 @@ from nlos_lit.runtime.memory import check_disk
 from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import register_settings, run_config
+from nlos_lit.training.explored import mark_interrupted
 from nlos_lit.training.folder import (
     OVERRIDES,
     begin_training,
@@ -41,7 +42,7 @@ from nlos_lit.training.folder import (
 )
 from nlos_lit.training.instantiate import build_all, builder
 from nlos_lit.training.origin import IMAGE, START, SURFACE, check_origin, finished_checkpoint
-from nlos_lit.training.outcome import write_results, write_surface_summary
+from nlos_lit.training.outcome import explore_results, write_results, write_surface_summary
 from nlos_lit.training.run_folder import (
     Run,
     field_shards,
@@ -101,6 +102,7 @@ def train(config: DictConfig) -> float | None:
     try:
         summary = fit(settings, of_surface, folder, checkpoint, began)
     except KeyboardInterrupt:
+        mark_interrupted(folder)
         if (folder / OVERRIDES).exists():
             again = shlex.quote(f"resume={folder}")
             log.info("interrupted; go on with: %s %s", typed("train"), again)
@@ -135,14 +137,16 @@ def _self_calibration(
     run.module.pipeline.phasor.hold()  # with the processes that end here
     if not trainer.is_global_zero:
         return None
-    refined = None
+    refined = surface = None
     if settings["refine"] or settings["effects"]:
         begun = folder / "refined" / "checkpoints" / "last.ckpt"
         goes_on = checkpoint is not None and history.ran == 0 and begun.exists()
         if goes_on:
             check_origin(begun, run.origin, SURFACE)
-        refined = _surface(run, of_surface, folder, begun if goes_on else None)[0]
-    return write_results(run, history, folder, time.perf_counter() - began, refined)
+        refined, surface, _ = _surface(run, of_surface, folder, begun if goes_on else None)
+    summary = write_results(run, history, folder, time.perf_counter() - began, refined)
+    explore_results(run, folder, summary, surface)
+    return summary
 
 
 def _surface_alone(
@@ -159,7 +163,9 @@ def _surface_alone(
     run.module.pipeline.phasor.hold()
     response = None if source is None else run.module.pipeline.laser_sensor
     refined, module, history = _surface(run, of_surface, folder, checkpoint, response)
-    return write_surface_summary(run, module, history, folder, time.perf_counter() - began, refined)
+    summary = write_surface_summary(run, module, history, folder, time.perf_counter() - began, refined)
+    explore_results(run, folder, summary, module)
+    return summary
 
 
 def _surface(

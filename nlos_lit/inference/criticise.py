@@ -143,6 +143,11 @@ class Turn:
     refused: dict[str, Confirmed] = field(default_factory=dict)
 
 
+Told = Callable[
+    [SurfelFit, SurfelFit, list[Turn]], None
+]  # fine fit without effects, present one, turns so far
+
+
 @dataclass
 class Findings:
     """What the loop leaves behind.
@@ -634,6 +639,7 @@ def criticise(
     s: CriticismSettings,
     seed: int,
     steps: Steps | None = None,
+    told: Told = lambda base, present, turns: None,
 ) -> Findings:
     """Find out, one after the other, what the capture asks for.
 
@@ -645,13 +651,16 @@ def criticise(
         s: settings.
         seed: of everything random.
         steps: says and keeps what is done.
+        told: called before the first turn and after each, see :data:`Told`.
 
     Returns:
         base, turns and final fit.
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
     first = fine = loop.fine(base, "without_effects")
-    coarse, turns = base, []
+    coarse = base
+    turns: list[Turn] = []
+    told(first, fine, turns)
     while len(coarse.extension.effects) < s.most:
         turn = loop.turn(coarse, fine)
         while turn.best is not None:
@@ -661,7 +670,9 @@ def criticise(
                 break
             turn = other
         turns.append(turn)
+        if turn.accepted:
+            coarse, fine = again, refined
+        told(first, fine, turns)
         if not turn.accepted:
             break
-        coarse, fine = again, refined
     return Findings(first, fine, turns, loop.losses(fine), coarse if fine is not first else None)

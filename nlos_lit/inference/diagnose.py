@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from torch import Tensor
@@ -14,7 +16,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Findings, criticise
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn, criticise
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
@@ -22,6 +24,8 @@ from nlos_lit.inference.split import split_spots
 from nlos_lit.inference.toys import run_toys
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
+
+Progress = Callable[[tuple[Tensor, VolumeGrid], SurfelFit, SurfelFit, list[Turn]], None]
 
 
 def diagnose(
@@ -35,6 +39,7 @@ def diagnose(
     folder: Path | None = None,
     settings: str = "",
     report: Report = lambda text, passed, left: None,
+    told: Progress = lambda image, base, present, turns: None,
 ) -> tuple[Diagnosis, Findings]:
     """Fit, criticise, measure.
 
@@ -49,6 +54,8 @@ def diagnose(
             arguments goes on; needed with ``options.toys``.
         settings: all that results depend on, see :class:`~nlos_lit.runtime.steps.Steps`.
         report: called as steps begin, see :class:`~nlos_lit.runtime.steps.Steps`.
+        told: called before the first turn and after each with the image and its grid, the fine fit without
+            effects, the present one, and the turns so far.
 
     Returns:
         the diagnosis, and the fits behind it.
@@ -84,7 +91,7 @@ def diagnose(
         again.counts = base.counts
         return again
 
-    found = criticise(base, rebuild, pipeline.grow, split, scan, options, seed, steps)
+    found = criticise(base, rebuild, pipeline.grow, split, scan, options, seed, steps, partial(told, image))
     null = None
     if options.toys:
         assert folder is not None, "toys are kept in a folder"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import io
 import json
 import math
 import os
@@ -65,6 +66,26 @@ def write_json(path: Path | str, data: Any) -> None:
     text = json.dumps(plain(data), indent=2, ensure_ascii=False, allow_nan=False)
     with whole_file(path) as partial:
         partial.write_text(text + "\n", encoding="utf-8")
+
+
+def write_depth(path: Path | str, depth: np.ndarray) -> None:
+    """Write a depth map as ``.npy``.
+
+    Args:
+        path: the target, written whole or not at all.
+        depth: ``[nx, ny]`` z, m, NaN where nothing is seen; kept as float32.
+
+    Examples:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_depth(f"{folder}/depth.npy", np.array([[0.5, np.nan]]))
+        ...     np.load(f"{folder}/depth.npy").tolist()
+        [[0.5, nan]]
+    """
+    content = io.BytesIO()
+    np.save(content, depth.astype(np.float32), allow_pickle=False)
+    with whole_file(path) as partial:
+        partial.write_bytes(content.getbuffer())
 
 
 def plain(data: Any) -> Any:

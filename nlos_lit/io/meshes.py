@@ -13,7 +13,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from nlos_lit.io.files import whole_file
+from nlos_lit.io.gltf import write_glb
 from nlos_lit.io.points import Points, grey_levels
+from nlos_lit.io.views import Mesh
 
 if TYPE_CHECKING:
     import open3d
@@ -87,10 +89,12 @@ def poisson_mesh(
 
 
 def write_mesh(path: Path | str, points: Points, depth: int = 8, trim: float = 1.5) -> MeshReport:
-    """Write the mesh of :func:`poisson_mesh` as binary PLY; where there is none nothing is written.
+    """Write the mesh of :func:`poisson_mesh` as binary PLY, and beside it as binary glTF.
+
+    Where there is none nothing is written.
 
     Args:
-        path: PLY file, written whole or not at all.
+        path: PLY file, written whole or not at all; the glTF file has the suffix ``.glb``.
         points: as for :func:`poisson_mesh`.
         depth: as for :func:`poisson_mesh`.
         trim: as for :func:`poisson_mesh`.
@@ -115,4 +119,30 @@ def write_mesh(path: Path | str, points: Points, depth: int = 8, trim: float = 1
         with whole_file(path) as partial:
             if not open3d.io.write_triangle_mesh(partial, mesh):
                 raise OSError(f"Open3D could not write {path}")
+        write_glb(Path(path).with_suffix(".glb"), _plain(mesh))
     return report
+
+
+def read_mesh(path: Path | str, most: int) -> Mesh | None:
+    """A mesh that :func:`write_mesh` wrote, with few triangles.
+
+    Garland and Heckbert, *Surface simplification using quadric error metrics*, SIGGRAPH 1997, by Open3D.
+
+    Args:
+        path: PLY file.
+        most: triangles that are kept.
+
+    Returns:
+        The mesh; None where there is no file.
+    """
+    if not Path(path).is_file():
+        return None
+    import open3d
+
+    mesh = open3d.io.read_triangle_mesh(Path(path))
+    return _plain(mesh.simplify_quadric_decimation(most) if len(mesh.triangles) > most else mesh)
+
+
+def _plain(mesh: open3d.geometry.TriangleMesh) -> Mesh:
+    grey = np.asarray(mesh.vertex_colors)[:, 0]
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles), grey)

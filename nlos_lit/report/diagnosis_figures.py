@@ -49,11 +49,12 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     """Every figure the diagnosis has results for, by file name, in the order of the report."""
     bin_length = diagnosis.capture.get("bin_length")
     shown: dict[str, Figure] = {}
+    calm = not (diagnosis.effects or diagnosis.unknown)
     for profile in diagnosis.profiles:
         name = f"residual_{profile.axis}"
         name += f"_{sum(other.startswith(name) for other in shown) + 1}" if name in shown else ""
         flat = profile.edges_y is None
-        shown[name] = residual_profile(profile, bin_length) if flat else residual_wall(profile)
+        shown[name] = residual_profile(profile, bin_length, calm) if flat else residual_wall(profile, calm)
     for term in diagnosis.unknown:
         if term.shape is not None:
             shown[f"unknown_{term.name}"] = free_shape(term.name, term.shape, bin_length)
@@ -84,12 +85,13 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
 
 
 @styled
-def residual_profile(profile: Profile, bin_length: float | None = None) -> Figure:
+def residual_profile(profile: Profile, bin_length: float | None = None, calm: bool = False) -> Figure:
     """Signed significance along an axis, before above after, on one scale; red beyond ±3σ.
 
     Args:
         profile: before and after; one panel where nothing changed.
         bin_length: m; where it is known, the time axis is told in ns, too.
+        calm: nothing was needed to explain it, and nothing is red: among many bands single ones stand out.
 
     Returns:
         One or two panels.
@@ -103,14 +105,15 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
         for sigma, alpha in ((3, 0.45), (2, 0.8)):
             axes.axhspan(-sigma, sigma, color=NOTHING, alpha=alpha, linewidth=0)
         axes.axhline(0, color=BLACK, linewidth=0.6)
-        axes.stairs(
-            np.where(np.abs(values) > 3, values, np.nan),
-            profile.edges,
-            fill=True,
-            color=RED,
-            alpha=0.55,
-            linewidth=0,
-        )
+        if not calm:
+            axes.stairs(
+                np.where(np.abs(values) > 3, values, np.nan),
+                profile.edges,
+                fill=True,
+                color=RED,
+                alpha=0.55,
+                linewidth=0,
+            )
         axes.stairs(values, profile.edges, baseline=None, color=BLUE, linewidth=1.1)
         if limit > 20:
             axes.set_yscale("symlog", linthresh=4, linscale=1.2)
@@ -130,12 +133,21 @@ def residual_profile(profile: Profile, bin_length: float | None = None) -> Figur
 
 
 @styled
-def residual_wall(profile: Profile) -> Figure:
-    """Signed significance over the wall, seen from it, before and after; one map where nothing changed."""
+def residual_wall(profile: Profile, calm: bool = False) -> Figure:
+    """Signed significance over the wall, seen from it, before and after; one map where nothing changed.
+
+    Args:
+        profile: of the wall.
+        calm: nothing was needed to explain it, and nothing is in full colour.
+
+    Returns:
+        One or two maps.
+    """
     panels, edges_y = _panels(profile), profile.edges_y
     assert edges_y is not None
     known = np.abs(np.concatenate([values[np.isfinite(values)] for values in panels.values()]))
     limit = max(3.0, float(np.quantile(known, 0.99))) if known.size else 3.0
+    limit = 2 * max(limit, float(known.max(initial=0.0))) if calm else limit
     high = np.ptp(edges_y) / np.ptp(profile.edges)
     figure = Figure(figsize=(0.9 + 4.3 * len(panels), min(7.0, 1.1 + 3.6 * high)))
     for axes, (name, values) in zip(
@@ -144,7 +156,7 @@ def residual_wall(profile: Profile) -> Figure:
         mesh = _map(axes, values, profile.edges, edges_y, cmap=SIGNED, norm=Normalize(-limit, limit))
         axes.set_title(f"{name}{_beyond(values)}", loc="left", fontsize="small")
         axes.set(xlabel=f"x ({profile.unit})", ylabel=f"y ({profile.unit})")
-    colour_bar(mesh, "residual (σ), 99 % inside")
+    colour_bar(mesh, "residual (σ)" if calm else "residual (σ), 99 % inside")
     return figure
 
 

@@ -6,20 +6,24 @@ import base64
 import html
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.io.files import whole_file, write_json
+from nlos_lit.report.advice import confidence, next_step
 from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
+from nlos_lit.report.glossary import glossary_list, glossed
 from nlos_lit.report.page_style import CSS
 from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, quantity
 from nlos_lit.report.style import save_figure
 from nlos_lit.report.verdict import (
+    at_noise,
     barely,
     invisible,
     misfit,
@@ -65,7 +69,10 @@ class Markup(str):
 
 
 def write_report(
-    diagnosis: Diagnosis, folder: Path | str, extra_figures: Mapping[str, Figure] | None = None
+    diagnosis: Diagnosis,
+    folder: Path | str,
+    extra_figures: Mapping[str, Figure] | None = None,
+    scene: Sequence[str] = (),
 ) -> Path:
     """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png``.
 
@@ -73,6 +80,7 @@ def write_report(
         diagnosis: that is shown.
         folder: for the files.
         extra_figures: further figures by name, shown at the end.
+        scene: settings of the command line that name the scene, for the command that the page proposes.
 
     Returns:
         The page's path.
@@ -93,7 +101,9 @@ def write_report(
     write_json(folder / "diagnosis.json", diagnosis.to_dict())
     page = folder / "report.html"
     with whole_file(page) as partial:
-        partial.write_text(report_html(diagnosis, images, list(extra)), encoding="utf-8")
+        explorable = (folder / "explore.html").is_file()
+        text = report_html(diagnosis, images, list(extra), scene, explorable)
+        partial.write_text(text, encoding="utf-8")
     return page
 
 
@@ -109,13 +119,21 @@ def log_figures(folder: Path | str, figures: Mapping[str, Figure]) -> None:
             writer.add_figure(f"diagnosis/{name}", figure)
 
 
-def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Iterable[str] = ()) -> str:
+def report_html(
+    diagnosis: Diagnosis,
+    images: Mapping[str, Markup],
+    extra: Iterable[str] = (),
+    scene: Sequence[str] = (),
+    explorable: bool = False,
+) -> str:
     """The page.
 
     Args:
         diagnosis: that is shown.
         images: HTML of the figures, by name.
         extra: names of those that go to the end.
+        scene: settings of the command line that name the scene.
+        explorable: ``explore.html`` is beside it.
 
     Returns:
         HTML that needs nothing but itself.
@@ -129,11 +147,18 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
     name = str(diagnosis.capture.get("name", "capture"))
     found = missing(diagnosis)
     each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
+    known: set[str] = set()
+    advice = next_step(diagnosis, scene)
+    command = f"<pre tabindex=0><code>{_text(advice.command)}</code></pre>" if advice.command else ""
+    link = '<p><a href="explore.html">Explore scene, wall and transients</a></p>' if explorable else ""
     parts = [
         f'<header><p class="over">Diagnosis of {_text(name)}</p>'
         f'<h1 class="{tone(diagnosis)}">{_text(verdict(diagnosis, listed=False))}</h1>{each}'
-        f"<p>{_text(sureness(diagnosis))}</p></header>",
+        f"<h2>How sure is that?</h2><p>{glossed(confidence(diagnosis), known)}</p>"
+        f'<div class="next"><h2>Do this next</h2><p>{glossed(advice.text, known)}</p>{command}</div>'
+        f"{link}</header>",
         _misfit_bar(diagnosis),
+        _section("How sure, in numbers", f"<p>{glossed(sureness(diagnosis), known)}</p>"),
         _section("What the simulation was extended with", _accepted(diagnosis, diagnosis.effects))
         if diagnosis.effects
         else "",
@@ -142,7 +167,7 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         if diagnosis.effects or diagnosis.unknown
         else "",
         _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
-        _section("Where simulation and measurement differ", shown("residual_")),
+        _section("Where simulation and measurement differ", _calm(diagnosis) + shown("residual_")),
         _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
         _section("Every known effect and free term, tested", shown("screening") + _screened(diagnosis))
         if diagnosis.screened
@@ -158,13 +183,14 @@ def report_html(diagnosis: Diagnosis, images: Mapping[str, Markup], extra: Itera
         else "",
         _section("More figures", "".join(images[n] for n in extra)) if extra else "",
         _section("Capture and run", _facts(diagnosis)),
+        _section("Words", glossary_list()),
     ]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
     title = f"<title>Diagnosis of {_text(name)}</title><style>{CSS}</style>"
     return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{head}{title}</head>\n<body>\n'
+        f'<!DOCTYPE html>\n<html lang="en"><head>{head}{title}</head>\n<body><main>\n'
         + "\n".join(filter(None, parts))
-        + "\n</body></html>\n"
+        + "\n</main></body></html>\n"
     )
 
 
@@ -175,6 +201,8 @@ def _misfit_bar(diagnosis: Diagnosis) -> str:
         "explained": ("explained, by free terms too" if diagnosis.unknown else "explained", m.explained),
         "unexplained": ("unexplained", m.unexplained),
     }
+    if at_noise(diagnosis):
+        parts = {"noise": parts["noise"], "within": ("left, within what is called noise", m.unexplained)}
     total = sum(value for _, value in parts.values())
     if not (math.isfinite(total) and total > 0):
         return ""
@@ -191,6 +219,24 @@ def _misfit_bar(diagnosis: Diagnosis) -> str:
     where = "spots that nothing was fitted to or chosen with" if m.untouched else "held-out spots"
     caption = f"<figcaption>Misfit of the simulation as it was (deviance per bin), on {where}.</figcaption>"
     return f'<figure><div class="bar">{strip}</div><div class="keys">{keys}</div>{caption}</figure>'
+
+
+def _calm(diagnosis: Diagnosis) -> str:
+    """Why bands that stand out are no finding, where there is none."""
+    if diagnosis.effects or diagnosis.unknown:
+        return ""
+    largest = max(
+        (float(np.nanmax(np.abs(p.before))) for p in diagnosis.profiles if np.isfinite(p.before).any()),
+        default=math.nan,
+    )
+    if not largest > 3:
+        return ""
+    text = (
+        f"Single bands reach {number(largest, 2)} σ: sums over many counts show errors that are far too small"
+        " to matter in any one bin. No term that would take them away has the evidence it needs, so none of"
+        " them is a finding, and nothing is marked."
+    )
+    return f"<p>{_text(text)}</p>"
 
 
 def _accepted(diagnosis: Diagnosis, terms: Iterable[Accepted]) -> str:
@@ -382,7 +428,7 @@ def _table(heads: list[str], rows: Iterable[list[Any]], style: str = "") -> str:
         for row in rows
     )
     return (
-        f'<div class="wide"><table class="{style}"><thead><tr>{top}</tr></thead><tbody><tr>'
+        f'<div class="wide" tabindex="0"><table class="{style}"><thead><tr>{top}</tr></thead><tbody><tr>'
         + "</tr><tr>".join(lines)
         + "</tr></tbody></table></div>"
     )

@@ -80,6 +80,17 @@ def tone(diagnosis: Diagnosis) -> str:
     return "found" if diagnosis.effects else "fine"
 
 
+def excess_share(diagnosis: Diagnosis) -> float:
+    """How far the base is above counting noise, as a share of that, where it was scored last."""
+    base, *_ = _scored(diagnosis)
+    return _excess(base) / base.deviance_noise
+
+
+def at_noise(diagnosis: Diagnosis) -> bool:
+    """No term was needed, and hardly anything is left that one could be needed for."""
+    return tone(diagnosis) == "fine" and not excess_share(diagnosis) > AT_NOISE
+
+
 def missing(diagnosis: Diagnosis) -> list[str]:
     """What the simulation misses, in plain words: each effect, with what it may be instead."""
     return [_one(diagnosis, effect) for effect in diagnosis.effects]
@@ -234,13 +245,12 @@ def _joined(parts: list[str], word: str) -> str:
 
 
 def _nothing(diagnosis: Diagnosis) -> str:
-    base, *_ = _scored(diagnosis)
-    excess = _excess(base) / base.deviance_noise
-    if not excess > AT_NOISE:
+    if at_noise(diagnosis):
         return "Nothing in the registry is needed: the fit is at the noise."
     return (
-        f"Nothing in the registry is needed: what is left, {percent(excess)} above counting noise, has no"
-        " clear shape along time, wall, scan or count rate; the fitted surface itself may be incomplete."
+        f"Nothing in the registry is needed: what is left, {percent(excess_share(diagnosis))} above counting"
+        " noise, has no clear shape along time, wall, scan or count rate; the fitted surface itself may be"
+        " incomplete."
     )
 
 

@@ -15,6 +15,7 @@ from nlos_lit.io.tensors import write_tensors
 from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import Ticker
 from nlos_lit.training.capture_fit import CaptureFit
+from nlos_lit.training.explored import LIVE_SPOTS, SPOTS, facts_of, keep, view_of
 from nlos_lit.training.shown import shown_spots
 
 
@@ -206,3 +207,40 @@ class Figures(L.Callback):
             ).items():
                 for board in boards:
                     board.experiment.add_figure(name, figure, global_step=trainer.current_epoch)
+
+
+class Explore(L.Callback):
+    """The page ``explore.html`` of a run while it goes on, see :mod:`nlos_lit.training.explored`.
+
+    Args:
+        every: iterations between pages; the first is made before the first iteration.
+    """
+
+    def __init__(self, every: int) -> None:
+        self.every = every
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Show what the fit starts from."""
+        self._keep(trainer, cast(CaptureFit, module), trainer.current_epoch)
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Show the state after every ``every`` iterations; the last is shown by the command itself."""
+        module, step = cast(CaptureFit, module), trainer.current_epoch + 1
+        if step % self.every == 0 and step != module.planned:
+            self._keep(trainer, module, step)
+
+    def _keep(self, trainer: L.Trainer, module: CaptureFit, step: int) -> None:
+        module.hold()
+        if trainer.is_global_zero:
+            capture, error = _data(trainer).capture, trainer.callback_metrics.get("heldout/nmse")
+            said = f"{module.what}: {step} of {module.planned}"
+            said += "" if error is None else f", held-out NMSE {float(error):.4f}"
+            folder = Path(trainer.default_root_dir)
+            folder = folder.parent if folder.name == "refined" else folder
+            models, scene = module.explored()
+            kept = module.origin.get("settings", {})
+            settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
+            facts = facts_of(settings, capture, "running", [said])
+            spots = SPOTS if scene.volume is None else LIVE_SPOTS
+            keep(folder, view_of(capture, models, scene, facts, spots))
+        module.release()

@@ -18,6 +18,8 @@ from nlos_lit.metrics.transients import expected_deviance, nmse_noise_floor, poi
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from nlos_lit.training.explored import Expected, Scene
+
 
 class CaptureFit(L.LightningModule):
     """A fit to the counts of a capture, one batch of spots an epoch.
@@ -65,6 +67,10 @@ class CaptureFit(L.LightningModule):
         Returns:
             name → figure.
         """
+
+    @abstractmethod
+    def explored(self) -> tuple[dict[str, Expected], Scene]:
+        """What a page shows of the present state: expected counts by the model's name, and the scene."""
 
     def hold(self) -> None:
         """Called by all processes before figures are made: the state stands still until :meth:`release`."""

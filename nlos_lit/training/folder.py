@@ -124,16 +124,16 @@ def resume_run(arguments: list[str]) -> None:
     now = [item for item in arguments[1:] if not item.startswith("resume=")]
     now += ["ckpt_path=last", f"hydra.run.dir='{folder}'"]
     replaced = {_key(item) for item in now}
-    arguments[1:] = [*(item for item in _begun_with(folder) if _key(item) not in replaced), *now]
+    arguments[1:] = [*(item for item in begun_with(folder) if _key(item) not in replaced), *now]
 
 
 def begun_from(folder: Path) -> Path | None:
     """The checkpoint that the run in a folder was begun from; None where it began from nothing."""
-    kept = given_values(_begun_with(folder)).get("ckpt_path")
+    kept = given_values(begun_with(folder)).get("ckpt_path")
     return None if kept is None else Path(kept)
 
 
-def _begun_with(folder: Path) -> list[str]:
+def begun_with(folder: Path) -> list[str]:
     """Settings of the run in a folder, as on a command line; the file may come from anywhere."""
     file = folder / OVERRIDES
     altered = UserError(f"{file} was altered: it must be a list of settings such as scene.iterations=100")

@@ -13,14 +13,15 @@ import torch
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
-from nlos_lit.io.files import write_json
+from nlos_lit.io.files import write_depth, write_json
 from nlos_lit.io.meshes import write_mesh
-from nlos_lit.io.points import Points, write_points
+from nlos_lit.io.points import Points, read_points, write_points
 from nlos_lit.io.volumes import write_volume
 from nlos_lit.metrics.geometry import depth_map, geometry_errors
 from nlos_lit.report import figures
 from nlos_lit.report.style import save_figure
 from nlos_lit.training.callbacks import History
+from nlos_lit.training.explored import RAYED_SPOTS, SPOTS, Scene, facts_of, keep, kept_mesh, view_of
 from nlos_lit.training.run_folder import Run
 from nlos_lit.training.shown import run_figures, shown_spots, surface_points
 from nlos_lit.training.summary import build_summary
@@ -88,6 +89,7 @@ def write_results(
     write_volume(folder / "volume.h5", volume.cpu().numpy(), grid, albedo=albedo.cpu().numpy())
     points = surface_points(module, capture, shown_spots(capture.n_spots, config["export"]["spots"]))
     write_points(folder / "points.ply", points)
+    write_depth(folder / "depth.npy", depth_map(points, grid.x, grid.y))
     mesh = write_mesh(folder / "mesh.ply", points, depth=config["export"]["mesh_depth"])
     if mesh.reason:
         log.warning("mesh.ply: %s", mesh.reason)
@@ -187,6 +189,63 @@ def write_surface_summary(
     )
     write_json(folder / "summary.json", summary)
     return summary
+
+
+def explore_results(run: Run, folder: Path, summary: dict[str, Any], surface: SurfaceFitting | None) -> None:
+    """Write ``view.npz`` and ``explore.html`` of a finished run.
+
+    Args:
+        run: fitted.
+        folder: with its other results.
+        summary: what ``summary.json`` holds.
+        surface: fitted; None where none was.
+    """
+    phasor = run.module.pipeline.phasor
+    with torch.no_grad():
+        volume = phasor().cpu().numpy()
+    if surface is None:
+        models, _ = run.module.explored()
+        clouds, mesh = {"points": read_points(folder / "points.ply")}, folder / "mesh.ply"
+    else:
+        models, scene = surface.explored()
+        clouds, mesh = dict(scene.clouds), folder / "refined" / "mesh.ply"
+    said = told_results(summary, folder)
+    keep(
+        folder,
+        view_of(
+            run.capture,
+            models,
+            Scene(clouds, kept_mesh(mesh), (volume, phasor.grid)),
+            facts_of(run.config["scene"], run.capture, "finished", said),
+            RAYED_SPOTS if surface is None else SPOTS,
+        ),
+    )
+
+
+def told_results(summary: dict[str, Any], folder: Path) -> list[str]:
+    """What came out, in sentences: the errors first, the next command last.
+
+    Args:
+        summary: of the run.
+        folder: of the run.
+
+    Returns:
+        two or three sentences.
+    """
+    nmse, refined = summary["heldout"]["nmse"], summary["refined"]
+    error = nmse["final"] if refined is None else refined["heldout"]["nmse"]
+    noise = nmse["noise_floor"] if refined is None else refined["heldout"]["nmse_noise_floor"]
+    best = f"; counting noise alone would give {noise:.4f}" if math.isfinite(noise) else ""
+    by = "" if refined is None else f", by {refined['surfels']} surfels"
+    change = f"from {nmse['initial']:.4f} to {error:.4f}"
+    said = [f"On spots that nothing was fitted to, the error (NMSE) went {change}{by}{best}."]
+    if refined is None:
+        said.append("Next: the same with refine=true fits a surface to the raw counts.")
+    elif refined["note"] is not None:
+        said.append(f"{refined['note'][:1].upper()}{refined['note'][1:]}.")
+    else:
+        said.append("The fitted surface is at the noise, as far as these counts can say.")
+    return said
 
 
 def heldout_scores(

@@ -237,7 +237,9 @@ def find_checkpoint(
     return others[-1]
 
 
-_PICTURES = 20 * 2**20  # figures as files and in TensorBoard, points, mesh
+_PICTURES = (
+    36 * 2**20
+)  # figures as files and in TensorBoard, points, mesh, two pages (one replaces the other)
 _SCRATCH = 100 * 2**20  # runs of samples that are worked on at once
 
 

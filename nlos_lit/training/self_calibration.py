@@ -16,6 +16,7 @@ from nlos_lit.functional.sharded import leave_buffers
 from nlos_lit.model.objective import Objective, parameter_groups, rated_groups
 from nlos_lit.model.pipeline import Pipeline
 from nlos_lit.training.capture_fit import CaptureFit
+from nlos_lit.training.explored import Expected, Scene
 from nlos_lit.training.shown import first_volume, run_figures
 
 if TYPE_CHECKING:
@@ -132,6 +133,16 @@ class SelfCalibration(CaptureFit):
             regular = self.regularisation(volume, self.pipeline.albedo(volume))
             clean = float(sparsity(volume))
         return {"loss": train["mse"] + sum(float(term) for term in regular.values()), "sparsity": clean}
+
+    @torch.no_grad()
+    def explored(self) -> tuple[dict[str, Expected], Scene]:
+        """Rendered counts, and the volume."""
+        volume = self.pipeline.phasor().cpu().numpy()
+
+        def rendered(spots: Tensor) -> Tensor:
+            return self.expected(spots.to(self.device))
+
+        return {"rendered": rendered}, Scene(volume=(volume, self.pipeline.phasor.grid))
 
     def figures(self, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
         """Kernel, transients, volume, albedo, surface: :func:`~nlos_lit.training.shown.run_figures`."""

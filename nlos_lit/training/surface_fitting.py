@@ -11,6 +11,7 @@ from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.strengths import report
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.report import figures
@@ -18,6 +19,7 @@ from nlos_lit.report.surface_figures import Front, FrontImage, overview
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.training.capture_fit import CaptureFit
+from nlos_lit.training.explored import Expected, Scene
 from nlos_lit.training.shown import shown_spots, spot_residuals, transients_of
 
 if TYPE_CHECKING:
@@ -133,6 +135,21 @@ class SurfaceFitting(CaptureFit):
     def loss_of(self, train: dict[str, float]) -> dict[str, float]:
         """Poisson deviance per bin of the training spots."""
         return {"loss": train["deviance_per_bin"]}
+
+    def explored(self) -> tuple[dict[str, Expected], Scene]:
+        """Counts expected of the surfels, where effects are fitted without and with them, and the surfels."""
+        model, extension = self.fit.model, self.fit.extension
+
+        def without(spots: Tensor) -> Tensor:
+            return model.expected(spots.to(model.laser.device), Extension([]))
+
+        def with_all(spots: Tensor) -> Tensor:
+            return model.expected(spots.to(model.laser.device), extension)
+
+        names = ", ".join(effect.name for effect in extension.effects)
+        models: dict[str, Expected]
+        models = {"rendered": without, f"extended by {names}": with_all} if names else {"rendered": with_all}
+        return models, Scene(clouds={"surfels": model.points()})
 
     def figures(self, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
         """Overview, points, transients and response of the present state.

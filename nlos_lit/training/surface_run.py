@@ -18,6 +18,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.strengths import report
+from nlos_lit.io.files import write_depth
 from nlos_lit.io.meshes import write_mesh
 from nlos_lit.io.points import write_points
 from nlos_lit.io.tensors import write_tensors
@@ -37,7 +38,7 @@ from nlos_lit.training.configs import settings_of
 from nlos_lit.training.outcome import geometry_of
 from nlos_lit.training.run_folder import Run
 from nlos_lit.training.shown import shown_spots, transients_of
-from nlos_lit.training.surface_fitting import SurfaceFitting
+from nlos_lit.training.surface_fitting import SurfaceFitting, front
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +98,8 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
     found = fitted_surfels(module.fit, run.data.heldout_spots, began)
     points = found.points()
     write_points(place / "points.ply", points)
+    seen = front(found.model)
+    write_depth(place / "depth.npy", seen.depth)
     mesh = write_mesh(place / "mesh.ply", points, depth=export["mesh_depth"])
     write_tensors(place / "surfels.pt", found.model.state_dict())
     names = [effect.name for effect in found.extension.effects]
@@ -126,7 +129,13 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
         "geometry": geometry_of(points, run),
         "seconds": found.seconds,
         "mesh": {"vertices": mesh.vertices, "triangles": mesh.triangles, "reason": mesh.reason},
+        "depth_axes": {"x": _ends_of(seen.x), "y": _ends_of(seen.y)},
     }
+
+
+def _ends_of(axis: np.ndarray) -> dict[str, float]:
+    """First, last and number of evenly spaced centres, m."""
+    return {"first": float(axis[0]), "last": float(axis[-1]), "cells": len(axis)}
 
 
 def heldout_excess(run: Run, found: FittedSurfels) -> Excess:

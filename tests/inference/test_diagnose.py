@@ -20,6 +20,7 @@ from data_modules.readers import write_capture
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.io.views import read_view
 
 SCENE = [
     "scene.simulate.scan.nx=24",
@@ -64,6 +65,21 @@ def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosis") / "one"
     command("diagnose", *SCENE, *SMALL, folder=folder)
     return folder
+
+
+def test_a_diagnosis_leaves_a_page_to_explore(finished):
+    view, said = (
+        read_view(finished / "diagnosis"),
+        json.loads((finished / "diagnosis" / "diagnosis.json").read_text()),
+    )
+    assert view.facts["status"] == "finished"
+    assert view.facts["profiles"] == said["profiles"]
+    assert view.facts["next"]["text"]
+    assert view.volume is not None
+    names = ", ".join(term["name"] for term in [*said["effects"], *said["unknown"]])
+    assert list(view.models) == ["rendered", *([f"extended by {names}"] if names else [])]
+    assert "explore.html" in (finished / "diagnosis" / "report.html").read_text(encoding="utf-8")
+    assert (finished / "diagnosis" / "explore.html").is_file()
 
 
 def test_a_diagnosis_leaves_page_numbers_and_figures(finished):

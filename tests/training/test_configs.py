@@ -303,6 +303,7 @@ def test_a_trainer_as_the_config_says(tmp_path):
         "History",
         "ProgressBar",
         "Figures",
+        "Explore",
         "ModelCheckpoint",
     ]
     checkpoint = trainer.callbacks[-1]

@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nlos_lit.capture.errors import UserError
 from nlos_lit.effects.strengths import report
 from nlos_lit.io.points import read_points
+from nlos_lit.io.views import read_view
 from nlos_lit.io.volumes import read_volume
 from nlos_lit.surfels.fitted import score_spots
 from nlos_lit.training.configs import compose
@@ -78,6 +79,29 @@ def finished(tmp_path_factory) -> Path:
         folder=folder,
     )
     return folder
+
+
+def test_a_run_leaves_a_page_to_explore(finished):
+    view, capture = read_view(finished), open_run(finished).capture
+    assert view.facts["status"] == "finished"
+    assert "train.py" in view.facts["origin"]["command"]
+    np.testing.assert_array_equal(view.counts, capture.gated_counts()[view.spots])
+    assert list(view.models) == ["rendered", "extended by irf_tail, wall_reflectance"]
+    model, extension = load_refined(finished, capture)
+    with torch.no_grad():
+        expected = model.expected(torch.from_numpy(view.spots[:5]), extension).numpy()
+    np.testing.assert_allclose(view.models["extended by irf_tail, wall_reflectance"][:5], expected, atol=0.05)
+    assert len(view.clouds["surfels"]) == len(read_points(finished / "refined" / "points.ply"))
+    page = (finished / "explore.html").read_text(encoding="utf-8")
+    assert "finished at" in page
+    depth = np.load(finished / "depth.npy")
+    assert depth.shape == read_volume(finished / "volume.h5")[0].shape[1:]
+    near = np.nanmedian(depth)
+    assert 0.4 < near < 0.95
+    assert (finished / "mesh.glb").exists() == (finished / "mesh.ply").exists()
+    refined = json.loads((finished / "summary.json").read_text())["refined"]
+    axes = refined["depth_axes"]
+    assert np.load(finished / "refined" / "depth.npy").shape == (axes["x"]["cells"], axes["y"]["cells"])
 
 
 def test_run_leaves_everything_a_later_command_needs(finished):

@@ -1,0 +1,76 @@
+"""Open the page of a run or a diagnosis."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import webbrowser
+from pathlib import Path
+
+from nlos_lit.capture.errors import UserError
+from nlos_lit.io.views import FILE as VIEW
+from nlos_lit.io.views import read_view
+from nlos_lit.runtime.claim import claim
+from nlos_lit.runtime.command_line import typed
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Open the page of the folder that ``arguments`` (or the command line's) name; return the exit status."""
+    given = parse(sys.argv[1:] if arguments is None else arguments)
+    try:
+        page = page_of(given.run)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(page)
+    if given.open and not webbrowser.open(page.resolve().as_uri()):
+        print("no browser was found here: open that file in one", file=sys.stderr)
+    return 0
+
+
+def page_of(run: Path) -> Path:
+    """The page of a run's folder, made again where it is missing.
+
+    Where the run says that it goes on but no process holds its folder, the page says that it was stopped.
+
+    Args:
+        run: folder of a run, of a diagnosis, or of a run that was diagnosed: the diagnosis is shown then.
+
+    Returns:
+        ``explore.html``.
+
+    Raises:
+        UserError: the folder holds nothing to look at.
+    """
+    from nlos_lit.report.explore import FILE as PAGE  # after the arguments: it loads torch
+    from nlos_lit.report.explore import write_page
+    from nlos_lit.training.explored import mark_interrupted
+
+    folder = run / "diagnosis" if (run / "diagnosis" / VIEW).is_file() else run
+    view = read_view(folder)
+    if view.facts["status"] == "running" and not _held(folder):
+        mark_interrupted(folder)
+    elif not (folder / PAGE).is_file():
+        write_page(folder, view)
+    return folder / PAGE
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    """What the command line says."""
+    parser = argparse.ArgumentParser(
+        prog=typed("view"), description="Open the page of a run or a diagnosis in the browser."
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run or of a diagnosis")
+    parser.add_argument(
+        "--no-open", dest="open", action="store_false", help="only print where the page is, and open nothing"
+    )
+    return parser.parse_args(arguments)
+
+
+def _held(folder: Path) -> bool:
+    """A process is at work in the run's folder."""
+    try:
+        claim(folder.parent if folder.name == "diagnosis" else folder)
+    except UserError:
+        return True
+    return False

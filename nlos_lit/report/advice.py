@@ -1,0 +1,167 @@
+"""What to make of a diagnosis: how sure it is in plain words, and what to do next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from nlos_lit.inference.criticise import Turn
+from nlos_lit.inference.result import Accepted, Diagnosis
+from nlos_lit.report.quantities import number, percent
+from nlos_lit.report.verdict import at_noise, excess_share, invisible, rivals
+from nlos_lit.report.words import describe
+
+# What tells where something without a name comes from, by the axis that it lies along.
+TELLS = {
+    "time": "Record the direct pulse alone and lay its shape beside the one below: what they share is the"
+    " instrument's. Then begin the gate later and diagnose again: what stays is none of the early light.",
+    "depth": "See whether the volume ends where the residual stands out (scene.volume.depth), and diagnose"
+    " again with a deeper one.",
+    "wall": "Lay the map below beside a photograph of the wall and the direct pulse of each spot. Then scan"
+    " again with the hidden scene moved: what keeps its place belongs to the wall or the optics.",
+    "scan": "Scan the same wall again in another order, for example backwards: what keeps its place on the"
+    " wall is not the scan's, what keeps its time is the rig's.",
+    "rate": "Record again at half the laser power: what becomes smaller comes from how photons are counted.",
+    "time×scan": "Record the direct pulse again and again for as long as a scan takes: a response that"
+    " changes shows there without any scene.",
+    "time×wall": "Record the direct pulse at the corners and the middle of the wall: a response that changes"
+    " over it shows there without any scene.",
+    "spot": "Record the same capture again: what comes back at the same spots belongs to them.",
+}
+FINDER = "See whether the shape below follows anything you know of the rig, and record the capture again."
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to do next.
+
+    Args:
+        text: a few sentences.
+        command: to be typed; empty where there is none.
+    """
+
+    text: str
+    command: str = ""
+
+
+def confidence(diagnosis: Diagnosis) -> str:
+    """How far the verdict can be trusted, without a number that needs explaining.
+
+    Args:
+        diagnosis: the whole.
+
+    Returns:
+        one word and what it means, in a few sentences.
+    """
+    terms = [*diagnosis.effects, *diagnosis.unknown]
+    if not terms:
+        return _of_nothing(diagnosis)
+    several = len(terms) > 1
+    it = "each of them" if several else "it"
+    held = all(term.heldout_gain.ci95[0] > 0 for term in terms)
+    if any(rivals(diagnosis, term) for term in terms):
+        first = "Open: that something is there is " + ("well supported" if held else "likely")
+        text = f"{first}, but what it is this capture cannot tell: more than one cause would look like this."
+    elif held:
+        text = (
+            f"Good: the counts ask for {it} by more than is needed, and {it} also predicts parts of the wall"
+            " that nothing was fitted to."
+        )
+    else:
+        text = (
+            f"Fair: the counts ask for {it} by more than is needed; that {it} predicts other parts of the"
+            " wall better may still be chance."
+        )
+    if not diagnosis.toys:
+        text += " How often as much comes up by itself was not counted here: criticism.toys=20 counts it."
+    return text
+
+
+def next_step(diagnosis: Diagnosis, scene: Sequence[str] = ()) -> Advice:
+    """The one thing to do first.
+
+    Args:
+        diagnosis: the whole.
+        scene: settings of the command line that name the scene.
+
+    Returns:
+        on the rig, or at the keyboard.
+    """
+    base = ["python", "train.py", *scene]
+    found = sorted(diagnosis.effects, key=_gain, reverse=True)
+    if found:
+        first = found[0]
+        known = shlex.join([*base, f"effects=[{','.join(e.name for e in diagnosis.effects)}]"])
+        others = rivals(diagnosis, first)
+        if others and first.split_by:
+            return Advice(
+                f"Tell the candidates apart: take {first.split_by}, and diagnose it. Until then the"
+                " reconstruction can be made with the first of them in the model:",
+                known,
+            )
+        remedy = describe(first.name).words.remedy
+        more = " Then the next one." if len(found) > 1 else ""
+        return Advice(f"{remedy}{more} Or leave the rig as it is and put it into the model:", known)
+    if diagnosis.unknown:
+        worst = max(diagnosis.unknown, key=_gain)
+        return Advice(
+            f"{TELLS.get(worst.axis, FINDER)} Until it has a name, read the picture with care where the"
+            " residual below stands out."
+        )
+    refined = shlex.join([*base, "refine=true"])
+    if at_noise(diagnosis):
+        return Advice(
+            "Nothing needs repair. Reconstruct with the simulation as it is; to see finer, count longer:",
+            refined,
+        )
+    return Advice(
+        "Look first at the scene, not at the rig: see whether the volume ends where the residual map below"
+        " stands out (scene.volume.depth), and let a finer surface try:",
+        refined,
+    )
+
+
+def told_turn(count: int, turn: Turn) -> str:
+    """What one turn of a diagnosis found, while the diagnosis goes on.
+
+    Args:
+        count: of the turn, from 1.
+        turn: that has ended.
+
+    Returns:
+        a sentence.
+    """
+    if turn.best is None:
+        return f"Turn {count}: nothing more is asked for."
+    phrase, found = describe(turn.best.name).phrase, turn.confirmed
+    nats = (
+        ""
+        if found is None
+        else f" ({number(found.evidence)} nats beside a fine scene, {number(found.needed)} needed)"
+    )
+    verb = "the simulation was extended by" if turn.accepted else "not confirmed:"
+    return f"Turn {count}: {verb} {phrase}{nats}."
+
+
+def _of_nothing(diagnosis: Diagnosis) -> str:
+    known = [s for s in diagnosis.screened if not describe(s.name).free]
+    hidden = sum(invisible(s) for s in known)
+    blind = (
+        f" {hidden} of {len(known)} could not have shown in this capture at any strength." if hidden else ""
+    )
+    if at_noise(diagnosis):
+        return (
+            "Good, within limits: the simulation predicts spots that it was not fitted to as well as counting"
+            f" allows. Effects weaker than those listed below may still be there.{blind}"
+        )
+    share = excess_share(diagnosis)
+    return (
+        f"Limited: the simulation is {percent(share)} above counting noise, for no reason that could be told,"
+        f" and weak effects may hide in that.{blind}"
+    )
+
+
+def _gain(term: Accepted) -> float:
+    gain = term.heldout_gain
+    return gain.deviance_per_bin_before - gain.deviance_per_bin_after
