@@ -16,7 +16,7 @@ from data_modules.nonsense import nonsense, volume_without_light
 from data_modules.plan import plan_capture
 from data_modules.readers import ReaderOptions, read_capture
 from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_truth, simulate_capture
-from data_modules.suspicions import suspicions
+from data_modules.suspicions import suspicions, whole_numbers
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
@@ -45,12 +45,15 @@ def load_scene(
         UserError: the data are not there (says where they come from and where to put them) or not usable, or
             they cannot be a capture of a hidden scene (:func:`~data_modules.nonsense.nonsense`).
     """
-    if scene["simulate"] is not None and scene["path"] is None:
+    looks_wrong: list[str] = []
+    simulated = scene["simulate"] is not None and scene["path"] is None
+    if simulated:
         capture, truth = _simulate(scene["simulate"], seed)
     else:
         scene = planned_scene(scene, data_dir, force)[0]
         path = find_file(scene, Path(data_dir))
         capture, truth = read_capture(path, scene["format"], options=_options(scene["reader"])), None
+        looks_wrong += whole_numbers(capture)  # sums hide it
     if scene["truth"] is not None:
         truth = _truth(load_truth(Path(scene["truth"])))
     capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
@@ -59,8 +62,9 @@ def load_scene(
     depth = scene["volume"]["depth"]
     wrong = nonsense(capture) or ([] if depth is None else volume_without_light(capture, tuple(depth)))
     _refuse(wrong, force)
-    measured = scene["path"] is not None or scene["simulate"] is None
-    for sentence in wrong or (suspicions(capture) if measured else ()):
+    if not wrong and not simulated:
+        looks_wrong += suspicions(capture)
+    for sentence in wrong or dict.fromkeys(looks_wrong):
         log.warning("%s", sentence)
     return capture, truth
 
