@@ -93,6 +93,8 @@ def planned_scene(
     capture = capture.sum_spots(scene["sum_spots"])
     _refuse(nonsense(capture), force)
     plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
+    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
+    _refuse(nonsense(capture), force)
     if depth is None and plan.depth is None:
         raise UserError(
             f"{path.name}: no light that comes back stands out of the noise, so the depths of the volume "
@@ -100,7 +102,6 @@ def planned_scene(
         )
     volume = {**scene["volume"], "depth": list(plan.depth or ()) if depth is None else depth}
     planned = {**scene, "sum_bins": plan.sum_bins, "gate": list(plan.gate), "volume": volume}
-    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
     near, far = volume["depth"]
     log.info(
         "plan for %s: %d bins summed to %.3g ps, gate [%d, %d), depth %.3g to %.3g m, planes %.3g mm apart, "

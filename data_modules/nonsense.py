@@ -20,6 +20,7 @@ SHORTEST, LONGEST = 0.03, 3000.0  # of a bin, ps
 NARROWEST, WIDEST = 1e-3, 50.0  # of a wall, m
 FARTHEST = 1000.0  # path to the gate's first bin, m
 CHANCE = 1e-6  # that noise is taken for light
+SCALES = (1, 8, 32)  # bins
 TOGETHER = 1024  # spots that are looked at at once
 
 
@@ -121,9 +122,9 @@ def noise_alone(capture: Capture) -> list[str]:
 def has_light(capture: Capture) -> bool:
     """Whether anything in the gate changes along time beyond noise.
 
-    In noise that is alike at all times, the spots' deviations from their means add up to a χ² along time,
-    those of neighbouring bins are uncorrelated, and no spot has a peak that Poisson counts would not reach.
-    Each of the three is taken for light but for a chance of ``CHANCE``.
+    In noise that is alike at all times, the spots' deviations from their means add up to a χ² along time, at
+    each of ``SCALES``, those of neighbouring bins are uncorrelated, and no spot has a peak that Poisson
+    counts would not reach. What has a chance of less than ``CHANCE`` by any of these is taken for light.
     """
     counts, seen = capture.counts[:, slice(*capture.gate)], capture.gated_observed()
     bins = counts.shape[1]
@@ -140,9 +141,13 @@ def has_light(capture: Capture) -> bool:
         pairs += int((known[:, 1:] * known[:, :-1]).sum())
     if variance == 0 or not math.isfinite(square):
         return True  # nothing that could be told
-    alike = stats.chi2.sf((columns**2).sum() / variance, bins - 1) > CHANCE
+    for width in SCALES:
+        groups = bins // width
+        sums = columns[: groups * width].reshape(groups, width).sum(axis=1)
+        if groups > 1 and stats.chi2.sf((sums**2).sum() / (width * variance), groups - 1) < CHANCE:
+            return True
     follow = product / square + 1 / bins
-    if not alike or follow * math.sqrt(max(pairs, 1)) > stats.norm.isf(CHANCE):
+    if follow * math.sqrt(max(pairs, 1)) > stats.norm.isf(CHANCE):
         return True
     return capture.is_counts and len(returns(capture).first) > 0
 

@@ -116,6 +116,8 @@ def check_assignments(command: str, arguments: list[str]) -> None:
                 if equals
                 else f"cannot use {argument!r}: write KEY=VALUE; --help lists the keys"
             )
+        if not text:
+            raise UserError(f"{key} has no value; it must be {rules[key]}")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError as error:

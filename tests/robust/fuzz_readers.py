@@ -1,8 +1,8 @@
 """Fuzz one format's reader, guided by the coverage of its code where atheris is installed.
 
-``python tests/robust/fuzz_readers.py OUT.jsonl format=ytal [seed=0] [runs=100000] [seconds=3600]`` adds a row;
-what fails is left in ``OUT.failures/`` and becomes, once mended, a file of ``corpus/FORMAT/``. Without atheris
-the bytes are drawn at random.
+``python tests/robust/fuzz_readers.py OUT.jsonl format=ytal [seed=0] [runs=100000] [seconds=3600]`` adds a
+row; what fails is left in ``OUT.failures/`` and becomes, once mended, a file of ``corpus/FORMAT/``. Without
+atheris the bytes are drawn at random.
 """
 
 from __future__ import annotations

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import sys
@@ -16,13 +17,11 @@ from typing import Any
 
 import h5py
 import numpy as np
-from hydra import compose, initialize_config_dir
 
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
-from nlos_lit.training.configs import register_settings
+from nlos_lit.training.configs import compose
 
-ROOT = Path(__file__).resolve().parents[2]
 BINS, BIN = 200, 0.012
 OURS = "data_modules"  # whose warnings count
 Items = dict[str, Any]
@@ -185,18 +184,18 @@ ALL = {
 }
 
 
+@functools.cache
+def of_a_file() -> dict[str, Any]:
+    """``scene=capture`` as composed, its file left open."""
+    scene: dict[str, Any] = compose("train", ["scene=capture"])["scene"]
+    return scene
+
+
 def scene_of(file: Path, items: Items) -> dict[str, Any]:
     """``scene=capture`` with a file, and the settings that belong to a case."""
-    from omegaconf import OmegaConf
-
-    register_settings()
-    overrides = ["scene=capture", f"scene.path={file}"]
-    for key, name in (("scene_gate", "gate"), ("scene_depth", "volume.depth")):
-        if key in items:
-            overrides.append(f"scene.{name}=[{items[key][0]},{items[key][1]}]")
-    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = compose("train", overrides)
-    scene: dict[str, Any] = OmegaConf.to_container(config.scene, resolve=True)  # type: ignore[assignment]
+    scene = {**of_a_file(), "path": str(file)}
+    scene["gate"] = items.get("scene_gate")
+    scene["volume"] = {**scene["volume"], "depth": items.get("scene_depth")}
     return scene
 
 
