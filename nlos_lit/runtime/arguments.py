@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.runtime.command_line import output_folder
-from nlos_lit.runtime.interrupts import take_interrupts
+from nlos_lit.runtime.hooks import take_hooks
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -40,7 +40,7 @@ def look_over(command: str, arguments: list[str], about: str | None) -> None:
         arguments: of the command line, the program's name first.
         about: the program's docstring, for ``--help``.
     """
-    take_interrupts()
+    take_hooks()
     given = get_args_parser().parse_known_args(arguments[1:])[0]
     if given.help:
         print(help_of(command, about or ""))

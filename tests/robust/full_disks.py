@@ -18,6 +18,7 @@ import h5py
 import numpy as np
 import torch
 from kill_commands import CRITICISM, HANG, SCENE, SURFACE, TRAIN, last_line, run
+from rows import add
 
 WORDS = ("No space left on device", "MiB free; make room")
 LOGGED = [item for item in TRAIN if not item.startswith("logger=")]
@@ -113,9 +114,7 @@ def main(arguments: list[str]) -> None:
             if how == "failed":
                 failures.append(f"{name}, {size} KiB, filled after {wait}: {said[:300]}")
     row = {"part": "disks", "tried": sum(came.values()), **came, "failures": failures}
-    with Path(arguments[0]).open("a") as file:
-        file.write(json.dumps(row) + "\n")
-    print(json.dumps(row))
+    add(arguments[0], row)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ atheris the bytes are drawn at random.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import resource
 import shutil
@@ -20,6 +19,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from rows import add
 
 try:
     import atheris
@@ -69,9 +69,7 @@ class Fuzz:
             "tried": self.number, **self.came, "failures": list(self.failures),
             "slowest_s": round(self.slowest, 2), "seconds": round(time.monotonic() - self.began),
         }  # fmt: skip
-        with self.out.open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        print(json.dumps(row), flush=True)
+        add(self.out, row)
 
 
 def main(arguments: list[str]) -> None:

@@ -21,9 +21,9 @@ import numpy as np
 import reader_files
 import scipy.io
 
+from data_modules.examine import examine
 from data_modules.nonsense import nonsense
 from data_modules.readers import ReaderOptions, read_capture
-from data_modules.suspicions import suspicions
 from nlos_lit.capture.errors import CaptureError
 
 HANG = 10  # s
@@ -53,6 +53,31 @@ INSTEAD: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+def arrays_of(name: str, folder: Path) -> list[str]:
+    """Names of the arrays that a writer's file holds; none of a picture."""
+    path = reader_files.WRITERS[name](folder)
+    if path.suffix == ".hdr":
+        return []
+    if h5py.is_hdf5(path):
+        with h5py.File(path) as held:
+            return list(held)
+    return [key for key in scipy.io.loadmat(path) if not key.startswith("__")]
+
+
+def replaced(name: str, key: str, value: Any, folder: Path, packed: bool = False) -> bytes:
+    """A writer's file with another value for one of its arrays; without it where that is None."""
+    path = reader_files.WRITERS[name](folder)
+    if h5py.is_hdf5(path):
+        with h5py.File(path, "a") as held:
+            del held[key]
+            if value is not None:
+                held[key] = value
+        return path.read_bytes()
+    held = {k: v for k, v in scipy.io.loadmat(path).items() if not k.startswith("__")} | {key: value}
+    scipy.io.savemat(path, {k: v for k, v in held.items() if v is not None}, do_compression=packed)
+    return path.read_bytes()
+
+
 def made(name: str, folder: Path) -> list[bytes]:
     """A writer's file, and the same with each of its arrays replaced in turn."""
     path = reader_files.WRITERS[name](folder)
@@ -60,28 +85,11 @@ def made(name: str, folder: Path) -> list[bytes]:
     if path.suffix == ".hdr":
         plain = reader_files.chen(folder, run_length=False).read_bytes()
         return [whole, plain, whole.replace(b"-Y 48", b"-Y 47"), whole.replace(b"+X 8", b"+X 9")]
-    found = [whole]
-    if h5py.is_hdf5(path):
-        with h5py.File(path) as held:
-            names = list(held)
-        for key in names:
-            for value in INSTEAD:
-                path.write_bytes(whole)
-                with h5py.File(path, "a") as held:
-                    del held[key]
-                    if value is not None:
-                        held[key] = value
-                found.append(path.read_bytes())
-        return found
-    arrays = {k: v for k, v in scipy.io.loadmat(path).items() if not k.startswith("__")}
-    for compressed in (False, True):
-        for key in arrays:
-            for value in INSTEAD:
-                changed = {**arrays, key: value}
-                kept = {k: v for k, v in changed.items() if v is not None}
-                scipy.io.savemat(path, kept, do_compression=compressed)
-                found.append(path.read_bytes())
-    return found
+    packings = (False,) if h5py.is_hdf5(path) else (False, True)
+    keys = arrays_of(name, folder)
+    return [whole] + [
+        replaced(name, key, value, folder, packed) for packed in packings for key in keys for value in INSTEAD
+    ]
 
 
 def beside(fmt: str, folder: Path) -> None:
@@ -166,17 +174,24 @@ def no_hang() -> Iterator[None]:
 
 
 def outcome(fmt: str, data: bytes, folder: Path) -> str:
-    """Read the file that some bytes stand for.
+    """Read the file that some bytes stand for, as :func:`outcome_of_file`."""
+    name, blob = file_of(fmt, data)
+    return outcome_of_file(fmt, name, blob, folder, sum(data) % LOOKED_AT == 0)
+
+
+def outcome_of_file(fmt: str, name: str, blob: bytes, folder: Path, look: bool = True) -> str:
+    """Read a file, and look it over.
 
     Args:
         fmt: of :data:`FORMATS`.
-        data: any.
-        folder: for the file; the other parts of a format that has several lie there.
+        name: of the writer that the file comes from.
+        blob: the file.
+        folder: for it; the other parts of a format that has several lie there.
+        look: whether it is looked over as ``inspect_capture.py`` does.
 
     Returns:
         ``read`` or ``refused``; every other end is an exception.
     """
-    name, blob = file_of(fmt, data)
     path = folder / ("sub_Sig.mat" if fmt == "cid" else "capture")
     path.write_bytes(blob)
     given = {key: FORMATS[fmt][1][key] for key in NEED.get(name, ())}
@@ -190,6 +205,6 @@ def outcome(fmt: str, data: bytes, folder: Path) -> str:
         return "refused"
     with no_hang():
         nonsense(capture)
-        if sum(data) % LOOKED_AT == 0:
-            suspicions(capture)
+        if look:
+            examine(capture)
     return "read"

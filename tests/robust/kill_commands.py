@@ -25,6 +25,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
+from rows import add
 
 ROOT = Path(__file__).resolve().parents[2]
 AGAIN = 6
@@ -311,13 +312,11 @@ def main(arguments: list[str]) -> None:
         began = time.monotonic()
         tally = kill(work, math.ceil(share * work.kills), np.random.default_rng([seed, index]))
         row = {
-            "part": "kills", "command": work.name, "seed": seed, "kills": sum(tally.kills.values()),
+            "part": "kills", "kind": work.name, "seed": seed, "kills": sum(tally.kills.values()),
             "by": tally.kills, "chains": tally.chains, "same": tally.same, "failures": tally.failures,
             "seconds": round(time.monotonic() - began),
         }  # fmt: skip
-        with open(arguments[0], "a") as file:
-            file.write(json.dumps(row) + "\n")
-        print(json.dumps(row), flush=True)
+        add(arguments[0], row)
 
 
 if __name__ == "__main__":

@@ -9,11 +9,11 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import io
-import json
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
+
+from rows import add
 
 from data_modules.simulate import ScanPlan, SensorModel
 from nlos_lit.commands.simulate import Options
@@ -94,10 +94,8 @@ def main(arguments: list[str]) -> None:
             came[how] += 1
             if how != "refused":
                 told.append(f"{argument}: {how} {said[:100]}")
-        row = {"part": "mistakes", "command": command, "tried": sum(came.values()), **came, "failures": told}
-        with Path(arguments[0]).open("a") as file:
-            file.write(json.dumps(row) + "\n")
-        print(json.dumps(row, indent=1))
+        row = {"part": "mistakes", "kind": command, "tried": sum(came.values()), **came, "failures": told}
+        add(arguments[0], row)
 
 
 if __name__ == "__main__":

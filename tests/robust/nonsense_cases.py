@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import logging
 import sys
 import tempfile
@@ -17,6 +16,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+from rows import add
 
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
@@ -238,9 +238,7 @@ def main(arguments: list[str]) -> None:
         if came in ("accepted", "failed"):
             silent.append(f"{name}: {came} {said}")
     row = {"part": "nonsense", "seed": seed, "tried": len(ALL), **counted, "failures": silent}
-    with open(arguments[0], "a") as file:
-        file.write(json.dumps(row) + "\n")
-    print(json.dumps(row))
+    add(arguments[0], row)
 
 
 if __name__ == "__main__":
