@@ -17,6 +17,7 @@ HERE = Path(__file__).parent
 ROWS = ROOT / "docs" / "robustness_rows.jsonl"
 PAGE = ROOT / "docs" / "robustness.md"
 BEGIN, END = "<!-- rows: made by tests/robust/campaign.py -->", "<!-- end of rows -->"
+SHOWN = 2  # failures of a row
 FORMATS = ("ytal", "lct", "fk", "phasor_field", "zaragoza", "chen", "tsai_ahn", "cid")
 PARTS = (
     ["mistakes.py"],
@@ -47,16 +48,22 @@ def tables(rows: list[dict[str, Any]]) -> str:
         )  # fmt: skip
         told += [f"### {title}", "", head, "|---" * (head.count("|") - 1) + "|"]
         told += [_line(row, kills) for row in of_part]
-        failures = [f"- {_name(row)}: {failure[:200]}" for row in of_part for failure in row["failures"]]
+        failures = [line for row in of_part for line in _failures(row)]
         if failures:
             told += ["", "Failed, as it was said:", "", *failures]
         where = sorted({f"`{row['command']}` at {row['commit']}" for row in of_part})
-        told += ["", "Made by " + ", ".join(where) + ".", ""]
+        told += ["", "Made by:", "", *(f"- {one}" for one in where), ""]
     return "\n".join(told).rstrip()
 
 
 def _name(row: dict[str, Any]) -> str:
     return str(row.get("format") or row.get("kind") or "all")
+
+
+def _failures(row: dict[str, Any]) -> list[str]:
+    told = [f"- {_name(row)}: `{failure[:70]}`" for failure in row["failures"][:SHOWN]]
+    rest = len(row["failures"]) - SHOWN
+    return [*told, f"- {_name(row)}: {rest} more like these"] if rest > 0 else told
 
 
 def _line(row: dict[str, Any], kills: bool) -> str:
