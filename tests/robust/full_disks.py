@@ -1,6 +1,7 @@
 """Commands whose disk is too small, or is filled by another while they work.
 
-``python tests/robust/full_disks.py OUT.jsonl [seed=0]`` adds a row. It mounts small tmpfs, which needs root.
+``python tests/robust/full_disks.py OUT.jsonl [seed=0]`` adds a row a command. It mounts small
+tmpfs, which needs root.
 """
 
 from __future__ import annotations
@@ -99,9 +100,9 @@ def main(arguments: list[str]) -> None:
     torch.set_num_threads(1)
     os.chdir(Path(__file__).resolve().parents[2])
     place = Path(tempfile.mkdtemp(prefix="full-"))
-    came: dict[str, int] = {"refused": 0, "done": 0, "failed": 0}
-    failures = []
     for name in COMMANDS:
+        came: dict[str, int] = {"refused": 0, "done": 0, "failed": 0}
+        failures = []
         began = time.monotonic()
         attempt(name, place, 1 << 16, None)
         took = time.monotonic() - began
@@ -113,8 +114,8 @@ def main(arguments: list[str]) -> None:
             print(f"{how} {name} {size} KiB, filled after {wait}: {said}", flush=True)
             if how == "failed":
                 failures.append(f"{name}, {size} KiB, filled after {wait}: {said[:300]}")
-    row = {"part": "disks", "tried": sum(came.values()), **came, "failures": failures}
-    add(arguments[0], row)
+        row = {"part": "disks", "kind": name, "tried": sum(came.values()), **came, "failures": failures}
+        add(arguments[0], row)
 
 
 if __name__ == "__main__":
