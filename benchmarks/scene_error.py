@@ -2,10 +2,13 @@
 
     python benchmarks/scene_error.py 2 4 21         development captures without effects
     python benchmarks/scene_error.py 2 truth=1      also scenes begun on the true surface
+    python benchmarks/scene_error.py 2 surfels.evenness=0 constant.surfels.fit.WORTH=0.5
 
 Printed is one JSON line a scene: the Kullback-Leibler divergence of its expected counts from the true ones,
 in nats over the fitted and over the select spots. Noise has no part in it. What stands there is what a
-missing effect must stand out from (docs/notebook.md). One thread.
+missing effect must stand out from (docs/notebook.md). On fitted spots it has two parts, both to second order:
+what the scene took up of the noise raises its likelihood over the true light's by as much as it costs
+(``variance_nats``), what it cannot follow lowers it (``bias_nats``). One thread.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ import json
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,9 +85,17 @@ def scenes(pipeline, capture, split, elements):
             yield f"on the true surface, cells/{parts}", on_surface(base, elements, parts)
 
 
-def report(number: int, from_truth: bool) -> None:
+def gain_over_truth(fit, expected: np.ndarray, spots: np.ndarray) -> float:
+    """Nats by which the fitted counts are likelier under the fit than under the true ``expected`` ones."""
+    true = expected[spots].astype(np.float64).clip(1e-9)
+    own = fit.model.expected(torch.from_numpy(spots), fit.extension).double().clamp_min(1e-9).numpy()
+    return float((fit.counts.double().numpy() * np.log(own / true) - own + true).sum())
+
+
+def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
     """Print one development capture's rows."""
     from blind_judge import pipeline_for
+    from surface import changed
     from wild_truth import make
 
     from data_modules.readers import read_capture
@@ -96,18 +108,23 @@ def report(number: int, from_truth: bool) -> None:
     first, last = capture.gate
     expected = truth.expected[:, first:last] if truth.expected.shape[1] > last - first else truth.expected
     pipeline, split = pipeline_for(capture), split_spots(capture)
+    pipeline = replace(pipeline, surfels=replace(pipeline.surfels, **changed(options)))
     began = time.process_time()
     elements = truth.scene.elements if from_truth and truth.scene.own else None
     for what, fit in scenes(pipeline, capture, split, elements):
         seconds, found = time.process_time() - began, score(fit, split.select)
+        fitted, gain = divergence(fit, expected, split.fit), gain_over_truth(fit, expected, split.fit)
         row = {
             "set": "development",
             "number": number,
             "family": truth.spec.family,
             "counts_per_spot": truth.spec.level,
+            "changed": options,
             "scene": what,
             "surfels": len(fit.model),
-            "fitted_nats": round(divergence(fit, expected, split.fit), 1),
+            "fitted_nats": round(fitted, 1),
+            "variance_nats": round((fitted + gain) / 2, 1),
+            "bias_nats": round((fitted - gain) / 2, 1),
             "fitted_spots": len(split.fit),
             "select_nats": round(divergence(fit, expected, split.select), 1),
             "select_spots": len(split.select),
@@ -120,5 +137,6 @@ def report(number: int, from_truth: bool) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
+    given = dict(a.split("=", 1) for a in sys.argv[1:] if "." in a)
     for wanted in (int(a) for a in sys.argv[1:] if a.isdigit()):
-        report(wanted, "truth=1" in sys.argv)
+        report(wanted, "truth=1" in sys.argv, given)

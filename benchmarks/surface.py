@@ -3,7 +3,7 @@
     python benchmarks/surface.py draw=0,1,2 seeds=3            # effect-free scenes of curved bodies
     python benchmarks/surface.py known=bunny,z data=DIR        # simulated and rendered, with the true surface
     python benchmarks/surface.py scene=su path=FILE seeds=3 effects=wall_reflectance,irf_tail
-    python benchmarks/surface.py draw=1,2,9 surfels.bending=1 constant.surfels.model.OPAQUE=0.3
+    python benchmarks/surface.py draw=1,2,9 surfels.bending=1 constant.surfels.fit.WORTH=0.5
 
 Settings of the fit and constants of ``nlos_lit`` can be changed, to see how much hangs on them. Prints one
 JSON line a fit. For drawn scenes the noise is the deviance of the same counts under the true expectation;
@@ -143,7 +143,7 @@ def of_letters(found: FittedSurfels, case: Case) -> dict[str, float]:
     }
 
 
-def changed(options: dict[str, str]) -> SurfelSettings:
+def changed(options: dict[str, str]) -> dict[str, Any]:
     """Settings by ``surfels.NAME=VALUE``; constants by ``constant.MODULE.NAME=VALUE`` are set in place."""
     own = {
         name.removeprefix("surfels."): ast.literal_eval(value)
@@ -156,12 +156,12 @@ def changed(options: dict[str, str]) -> SurfelSettings:
             place = importlib.import_module(f"nlos_lit.{module}")
             getattr(place, constant)  # one that is there
             setattr(place, constant, ast.literal_eval(value))
-    return SurfelSettings(**own)
+    return own
 
 
 def fit_rows(case: Case, options: dict[str, str]) -> None:
     """One line a seed."""
-    settings = changed(options)
+    settings = SurfelSettings(**changed(options))
     capture = case.capture
     block = 8 if capture.n_spots >= 4096 else 4
     mask, lit = heldout_mask(capture, block, 4), capture.gated_counts().any(1)

@@ -24,7 +24,7 @@ from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
-WORTH = 0.05  # nats a parameter that another round must gain
+WORTH = 0.1  # nats a parameter that another round must gain, or surfels that are divided
 PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "lays", "history", "losses")
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
@@ -460,14 +460,14 @@ class SurfelFit:
 
         False surfels are faint, and must not hide what is true; dark surfaces are faint, and hide.
         """
-        found = []
+        counts, spots, found = self.counts[self.tested], self.train[self.tested], []
         for opaque in OPAQUE:
             self.model.opaque = opaque
-            self.model.update_visibility()
-            expected = self.model.expected(self.train[self.tested], self.extension).clamp_min(1e-9)
-            nats = (torch.xlogy(self.counts[self.tested], expected) - expected).double().sum()
-            found.append((float(nats), opaque, self.model.visible))
-        _, self.model.opaque, self.model.visible = max(found, key=lambda each: each[0])
+            self.model.update_visibility(spots)
+            expected = self.model.expected(spots, self.extension).clamp_min(1e-9)
+            found.append((float((torch.xlogy(counts, expected) - expected).double().sum()), opaque))
+        self.model.opaque = max(found)[1]
+        self.model.update_visibility()
 
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""

@@ -244,9 +244,15 @@ class SurfelModel(nn.Module):
         return 0.5 * (self.raw_side / SIDE).square().sum()
 
     @torch.no_grad()
-    def update_visibility(self) -> None:
-        """Find which surfels each spot sees, see :meth:`sees`."""
-        self.visible = self.sees(torch.arange(len(self.laser), device=self.laser.device), self.centre())
+    def update_visibility(self, spots: Tensor | None = None) -> None:
+        """Find which surfels each spot sees, see :meth:`sees`.
+
+        Args:
+            spots: ``[B]`` rows of the capture; the others see all. None finds it for every spot.
+        """
+        rows = torch.arange(len(self.laser), device=self.laser.device) if spots is None else spots
+        self.visible = torch.ones(len(self.laser), len(self), dtype=torch.bool, device=self.laser.device)
+        self.visible[rows] = self.sees(rows, self.centre())
 
     @torch.no_grad()
     def sees(self, spots: Tensor, places: Tensor) -> Tensor:
