@@ -7,7 +7,7 @@ VENV ?= .venv
 ARGS ?=
 STAMP := $(VENV)/.installed
 
-.PHONY: run test slow lint types clean setup results docs tal
+.PHONY: run test slow fuzz lint types clean setup results docs tal
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
@@ -17,6 +17,11 @@ test: $(STAMP)
 
 slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)
+
+# All robustness runs, for hours: docs/robustness.md. Without atheris (Linux alone) files are changed at random.
+fuzz: $(STAMP)
+	$(VENV)/bin/python -m pip install -q -r scripts/requirements-fuzz.txt || echo "no atheris: changes are drawn at random"
+	OMP_NUM_THREADS=1 PYTHONPATH=. $(VENV)/bin/python tests/robust/campaign.py
 
 lint: $(STAMP)
 	$(VENV)/bin/python -m ruff check .

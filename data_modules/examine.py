@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from data_modules.nonsense import nonsense
 from data_modules.plan import Plan, plan_capture, returns
 from data_modules.readers import READERS
 from data_modules.readers.assemble import direct_pulse
@@ -48,7 +49,7 @@ def examine(capture: Capture) -> Findings:
     pulse = direct_pulse(known, capture.bin_length, capture.t_start) if first > 0 else None
     share = float(known[:first].sum() / known.sum()) if pulse is not None else 0.0
     depths = returns(capture).first / 2
-    warnings = (*suspicions(capture), *strange_depths(capture, depths))
+    warnings = tuple(nonsense(capture)) or (*suspicions(capture), *strange_depths(capture, depths))
     return Findings(mean, totals, pulse, share, depths, plan_capture(capture), warnings)
 
 

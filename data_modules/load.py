@@ -12,67 +12,78 @@ import numpy as np
 import pooch
 import yaml
 
+from data_modules.nonsense import nonsense, volume_without_light
 from data_modules.plan import plan_capture
 from data_modules.readers import ReaderOptions, read_capture
 from data_modules.simulate import SCENES, ScanPlan, SensorModel, Truth, load_truth, simulate_capture
+from data_modules.suspicions import suspicions, whole_numbers
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.surface_truth import SurfaceTruth
 from nlos_lit.places import CONF
 
 log = logging.getLogger(__name__)
-SMALLEST, LARGEST = 1e-15, 1e12  # of a capture's largest value; squares of it stand in single precision
 
 
 def load_scene(
-    scene: Mapping[str, Any], data_dir: str | Path, seed: int
+    scene: Mapping[str, Any], data_dir: str | Path, seed: int, force: bool = False
 ) -> tuple[Capture, SurfaceTruth | None]:
     """The scene's capture, ready to fit, and the true surface where it is known.
+
+    What looks wrong in a file's counts is told in the log.
 
     Args:
         scene: a config of conf/scene.
         data_dir: folder in which downloaded files are looked for.
         seed: of the photon statistics of a simulated scene.
+        force: what cannot be a capture of a hidden scene is told in the log, too, and not refused.
 
     Returns:
         Counts summed and gated as the scene says; the surface as seen from the wall, or None.
 
     Raises:
         UserError: the data are not there (says where they come from and where to put them) or not usable, or
-            their largest value is no count and no intensity.
+            they cannot be a capture of a hidden scene (:func:`~data_modules.nonsense.nonsense`).
     """
-    if scene["simulate"] is not None and scene["path"] is None:
+    looks_wrong: list[str] = []
+    simulated = scene["simulate"] is not None and scene["path"] is None
+    if simulated:
         capture, truth = _simulate(scene["simulate"], seed)
     else:
-        scene = planned_scene(scene, data_dir)[0]
+        scene = planned_scene(scene, data_dir, force)[0]
         path = find_file(scene, Path(data_dir))
         capture, truth = read_capture(path, scene["format"], options=reader_options(scene["reader"])), None
+        looks_wrong += whole_numbers(capture)  # sums hide it
     if scene["truth"] is not None:
         truth = _truth(load_truth(Path(scene["truth"])))
     capture = capture.sum_bins(scene["sum_bins"]).sum_spots(scene["sum_spots"])
     if scene["gate"] is not None:
         capture = capture.with_gate(*scene["gate"])
-    largest = float(capture.counts.max())
-    if not SMALLEST < largest < LARGEST:
-        raise UserError(
-            f"the capture's largest value is {largest:.3g}; what is computed of values beyond {SMALLEST:g} "
-            f"to {LARGEST:g} is lost in rounding: look for a damaged value, or give values in another unit"
-        )
+    depth = scene["volume"]["depth"]
+    wrong = nonsense(capture) or ([] if depth is None else volume_without_light(capture, tuple(depth)))
+    _refuse(wrong, force)
+    if not wrong and not simulated:
+        looks_wrong += suspicions(capture)
+    for sentence in wrong or dict.fromkeys(looks_wrong):
+        log.warning("%s", sentence)
     return capture, truth
 
 
-def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[str, Any], Capture | None]:
+def planned_scene(
+    scene: Mapping[str, Any], data_dir: str | Path, force: bool = False
+) -> tuple[dict[str, Any], Capture | None]:
     """A scene with what it leaves to its data filled in: bins to sum, gate, depths.
 
     Args:
         scene: a config of conf/scene; ``sum_bins`` or ``volume.depth`` may be null.
         data_dir: folder in which downloaded files are looked for.
+        force: what cannot be a capture of a hidden scene is planned for, too.
 
     Returns:
         The scene, and the capture as it will be fitted, where it had to be read.
 
     Raises:
-        UserError: the data are not there, or show no light to plan by.
+        UserError: the data are not there, cannot be a capture of a hidden scene, or show no light to plan by.
     """
     depth = scene["volume"]["depth"]
     if scene["sum_bins"] is not None and depth is not None:
@@ -80,7 +91,10 @@ def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[
     path = find_file(scene, Path(data_dir))
     capture = read_capture(path, scene["format"], options=reader_options(scene["reader"]))
     capture = capture.sum_spots(scene["sum_spots"])
+    _refuse(nonsense(capture), force)
     plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
+    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
+    _refuse(nonsense(capture), force)
     if depth is None and plan.depth is None:
         raise UserError(
             f"{path.name}: no light that comes back stands out of the noise, so the depths of the volume "
@@ -88,7 +102,6 @@ def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[
         )
     volume = {**scene["volume"], "depth": list(plan.depth or ()) if depth is None else depth}
     planned = {**scene, "sum_bins": plan.sum_bins, "gate": list(plan.gate), "volume": volume}
-    capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)
     near, far = volume["depth"]
     log.info(
         "plan for %s: %d bins summed to %.3g ps, gate [%d, %d), depth %.3g to %.3g m, planes %.3g mm apart, "
@@ -98,6 +111,11 @@ def planned_scene(scene: Mapping[str, Any], data_dir: str | Path) -> tuple[dict[
         1e3 * (volume["depth_pitch"] or plan.depth_pitch), 100 * plan.wavelength,
     )  # fmt: skip
     return planned, capture
+
+
+def _refuse(wrong: list[str], force: bool) -> None:
+    if wrong and not force:
+        raise UserError(f"{wrong[0]} (force=true goes on)")
 
 
 def find_file(scene: Mapping[str, Any], data_dir: Path) -> Path:

@@ -182,5 +182,5 @@ def light_of(level: np.ndarray, width: int, is_counts: bool) -> tuple[np.ndarray
     if not is_counts:
         return above, 0.0, bool(above.max() > 0)
     usual = max(float(np.median(level)) * width, 1.0)
-    chance = len(level) * stats.poisson.sf(round(float(level.max()) * width) - 1, usual)
+    chance = len(level) * stats.poisson.sf(np.rint(float(level.max()) * width) - 1, usual)
     return above, math.sqrt(usual) / width, bool(chance < CHANCE)

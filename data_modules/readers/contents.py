@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import h5py
@@ -33,11 +33,13 @@ class Entry:
         shape: in MATLAB's axis order where MATLAB wrote it.
         numeric: it holds real numbers.
         size: in full, bytes.
+        empty: it stands for None (a null dataspace of HDF5).
     """
 
     shape: tuple[int, ...]
     numeric: bool
     size: int
+    empty: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,10 @@ class Contents:
     def has(self, *names: str) -> bool:
         """Whether all of these arrays are there."""
         return all(name in self.entries for name in names)
+
+    def given(self, name: str) -> bool:
+        """Whether the file says anything under this name."""
+        return name in self.entries and not self.entries[name].empty
 
     def ndim(self, name: str) -> int:
         """Number of axes of a numeric array; -1 where it is absent or not numeric."""
@@ -151,6 +157,16 @@ class Contents:
                 f"{name} in {self.path.name} must be one finite number; found {values.size} values"
             )
         return float(values.reshape(()))
+
+    def flag(self, name: str) -> bool:
+        """A truth value, stored as true and false or as 1 and 0.
+
+        Raises:
+            CaptureError: as of `read`, or another value.
+        """
+        if self.ndim(name) < 0 or self.scalar(name) not in (0, 1):
+            raise CaptureError(f"{name} in {self.path.name} must be true or false (1 or 0)")
+        return bool(self.scalar(name))
 
     def text(self, name: str) -> str:
         """A string of an HDF5 file; empty where it is absent or not text."""
@@ -266,11 +282,10 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
                     matlab = matlab or "MATLAB_class" in dataset.attrs
                     numeric = dataset.shape is not None and dataset.dtype.kind in "uifb"
                     shape = dataset.shape or ()
-                    entries[label] = Entry(shape, numeric, math.prod(shape) * dataset.dtype.itemsize)
+                    size = math.prod(shape) * dataset.dtype.itemsize
+                    entries[label] = Entry(shape, numeric, size, dataset.shape is None)
     if matlab:
-        entries = {
-            name: Entry(entry.shape[::-1], entry.numeric, entry.size) for name, entry in entries.items()
-        }
+        entries = {name: replace(entry, shape=entry.shape[::-1]) for name, entry in entries.items()}
     return Contents(path, "hdf5", entries, matlab)
 
 

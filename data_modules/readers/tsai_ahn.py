@@ -76,7 +76,7 @@ def _read_struct(path: Path, contents: Contents, options: ReaderOptions) -> Capt
     length = (
         bin_length_of(options.bin_width_ps) if options.bin_width_ps else contents.scalar("NLOSDATA.delta")
     )
-    confocal = bool(contents.scalar("NLOSDATA.is_confocal")) if "NLOSDATA.is_confocal" in contents else False
+    confocal = contents.flag("NLOSDATA.is_confocal") if "NLOSDATA.is_confocal" in contents else False
     data = contents.counts("NLOSDATA.transient")
     spots = len(laser) if confocal else len(laser) * len(sensor)
     shape: tuple[int, ...] | None = None

@@ -73,7 +73,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     length = contents.scalar("delta_t")
     if not 1e-6 < length < 10:
         raise CaptureError(f"delta_t in {path.name} must be a path length in metres; found {length}")
-    t_start = contents.scalar("t_start") if contents.ndim("t_start") >= 0 else 0.0
+    t_start = contents.scalar("t_start") if contents.given("t_start") else 0.0
     text = contents.text("scene_info")
     ours = own_facts(text, path)
     geometry: dict[str, Any] = {
@@ -88,9 +88,8 @@ def read(path: Path, options: ReaderOptions) -> Capture:
         return _own(path, options, ours, counts, axes, geometry, t_start, _observed(contents))
     steps: list[str] = []
     devices = {name: _device(contents, name) for name in ("laser_xyz", "sensor_xyz")}
-    if contents.ndim("t_accounts_first_and_last_bounces") >= 0 and contents.scalar(
-        "t_accounts_first_and_last_bounces"
-    ):
+    whole_way = "t_accounts_first_and_last_bounces"
+    if contents.given(whole_way) and contents.flag(whole_way):
         if devices["laser_xyz"] is None or devices["sensor_xyz"] is None:
             raise CaptureError(
                 f"{path.name} counts time from laser to sensor but does not say where they are (laser_xyz, "
@@ -217,12 +216,12 @@ def _spots(contents: Contents) -> tuple[np.ndarray, np.ndarray, tuple[int, ...] 
     name = contents.path.name
     values = contents.counts("H")
     kind = {3: T_SX_SY, 5: T_LX_LY_SX_SY, 2: T_SI}.get(values.ndim, 0)
-    if contents.ndim("H_format") >= 0:
-        kind = int(contents.scalar("H_format"))
+    if contents.given("H_format"):
+        stated = contents.scalar("H_format")
+        kind = int(stated) if stated in _AXES else 0
     if _AXES.get(kind) != values.ndim:
         raise CaptureError(
-            f"H in {name} has shape {values.shape}, which H_format {kind} does not fit (1: T_Sx_Sy … 4: "
-            "T_Li_Si)"
+            f"H in {name} has shape {values.shape}, which its H_format does not fit (1: T_Sx_Sy … 4: T_Li_Si)"
         )
     laser, sensor = (contents.places(key) for key in ("laser_grid_xyz", "sensor_grid_xyz"))
     for key, points in (("laser_grid_xyz", laser), ("sensor_grid_xyz", sensor)):
@@ -280,7 +279,7 @@ def _pair(
 def _normals(contents: Contents, name: str, points: np.ndarray) -> np.ndarray:
     """The file's normals; +z where it has none."""
     key = f"{name}_grid_normals"
-    if contents.ndim(key) < 1:
+    if not contents.given(key):
         return np.broadcast_to([0.0, 0.0, 1.0], points.shape)
     normals = contents.places(key)
     if normals.shape != points.shape:
@@ -291,7 +290,7 @@ def _normals(contents: Contents, name: str, points: np.ndarray) -> np.ndarray:
 
 
 def _device(contents: Contents, name: str) -> np.ndarray | None:
-    if contents.ndim(name) < 1:
+    if not contents.given(name):
         return None
     place = contents.places(name).ravel()
     return place if place.shape == (3,) else None

@@ -18,6 +18,7 @@ import numpy as np
 from nlos_lit.capture.errors import CaptureError
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
+SHORTEST_BIN, LONGEST_BIN = 1e-9, 1e6  # m
 
 Value = TypeVar("Value")
 
@@ -126,8 +127,11 @@ class Capture:
                     f"{name} holds a zero vector; wall normals must be unit vectors towards the hidden scene"
                 )
             object.__setattr__(self, name, normals / lengths)
-        if not (np.isfinite(self.bin_length) and self.bin_length > 0):
-            raise CaptureError(f"bin_length must be a positive length in metres; found {self.bin_length}")
+        if not SHORTEST_BIN < self.bin_length < LONGEST_BIN:
+            raise CaptureError(
+                f"bin_length must be a length in metres, {SHORTEST_BIN:g} to {LONGEST_BIN:g}; found "
+                f"{self.bin_length}"
+            )
         if not np.isfinite(self.t_start):
             raise CaptureError(f"t_start must be finite; found {self.t_start}")
         if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:

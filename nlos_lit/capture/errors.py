@@ -27,7 +27,10 @@ class UserError(Exception):
 
 
 class CaptureError(UserError, ValueError):
-    """A capture (file, array or geometry) is unusable."""
+    """A capture (file, array or geometry) is unusable; one line, whatever names a file has in it."""
+
+    def __str__(self) -> str:
+        return super().__str__().replace("\n", "\\n")
 
 
 class MemoryBudgetError(UserError, MemoryError):

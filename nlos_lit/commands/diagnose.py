@@ -66,7 +66,7 @@ def diagnose(config: DictConfig) -> None:
         take_folder(folder)
         write_config(settings, folder)
         scene, model = settings["scene"], settings["model"]
-        capture = load_scene(scene, settings["data_dir"], settings["seed"])[0]
+        capture = load_scene(scene, settings["data_dir"], settings["seed"], settings["force"])[0]
     else:
         folder = Path(config.run)
         claim(folder)

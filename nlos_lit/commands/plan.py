@@ -29,7 +29,7 @@ def plan(config: DictConfig) -> None:
     if config.get("run") is not None and "criticism" in config:
         return
     scene = cast(dict[str, Any], OmegaConf.to_container(config.scene, resolve=True))
-    planned, capture = planned_scene(scene, config.data_dir)
+    planned, capture = planned_scene(scene, config.data_dir, config.force)
     if capture is None:
         return
     for key in ("sum_bins", "gate", "volume"):

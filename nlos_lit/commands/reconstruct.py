@@ -53,7 +53,7 @@ def reconstruct(config: DictConfig) -> None:
     choose_threads(settings["threads"])
     write_config(settings, folder)
     scene, method = settings["scene"], settings["method"]
-    capture, truth = load_scene(scene, settings["data_dir"], settings["seed"])
+    capture, truth = load_scene(scene, settings["data_dir"], settings["seed"], settings["force"])
     grid = volume_grid(capture, **scene["volume"])
     needed = estimate_bytes(capture, grid, method["name"])
     check_machine(needed, f"method={method['name']}")

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table
 from nlos_lit.paper.experiments import EXPERIMENTS
 from nlos_lit.paper.record import read_record
@@ -64,7 +65,8 @@ def update_page(page: Path, results: Path) -> list[str]:
             f"{begin(name)}\n{END}", f"{begin(name)}\nNot measured yet: `python results.py {name}`.\n{END}"
         )
     text = replace_part(text, GLANCE, glance(stored))
-    page.write_text(text, encoding="utf-8")
+    with whole_file(page) as partial:
+        partial.write_text(text, encoding="utf-8")
     return list(stored)
 
 

@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.places import CONF
 from nlos_lit.runtime.command_line import as_typed, output_folder
+from nlos_lit.runtime.hooks import take_hooks
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
 
 OF_HYDRA = ("hydra", "profile")
@@ -39,6 +40,7 @@ def look_over(command: str, arguments: list[str], about: str) -> None:
         arguments: of the command line.
         about: first lines of ``--help``.
     """
+    take_hooks()
     given = get_args_parser().parse_known_args(arguments)[0]
     if given.help:
         print(help_of(command, about))
@@ -114,6 +116,8 @@ def check_assignments(command: str, arguments: list[str]) -> None:
                 if equals
                 else f"cannot use {argument!r}: write KEY=VALUE; --help lists the keys"
             )
+        if not text:
+            raise UserError(f"{key} has no value; it must be {rules[key]}")
         try:
             value = yaml.safe_load(text)
         except yaml.YAMLError as error:

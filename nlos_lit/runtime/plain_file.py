@@ -11,6 +11,7 @@ import inspect
 import io
 import json
 import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,14 +87,27 @@ def write_plain(
     tree = json.dumps(apart(value)).encode()
     whole = io.BytesIO()
     np.savez(whole, tree=np.frombuffer(tree, np.uint8), **arrays)  # type: ignore[arg-type]  # arrays, not flags
+    write_whole(file, whole.getvalue())
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file that appears when it is whole.
+
+    Args:
+        file: to write; missing folders are made.
+        content: of it.
+    """
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(".part")
+    part = file.with_name(f".{file.name}.{threading.get_ident()}.part")
     try:
         with part.open("wb") as written:
-            written.write(whole.getbuffer())
+            written.write(content)
             written.flush()
             os.fsync(written.fileno())
         part.rename(file)
+    except OSError as error:
+        error.filename = error.filename or str(file)  # a write that fails names none
+        raise
     finally:
         part.unlink(missing_ok=True)
 

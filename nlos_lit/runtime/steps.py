@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 
 from nlos_lit.capture.errors import UserError
-from nlos_lit.runtime.plain_file import Kind, not_ours, read_plain, record, write_plain
+from nlos_lit.runtime.plain_file import Kind, not_ours, read_plain, record, write_plain, write_whole
 
 T = TypeVar("T")
 SETTINGS = "settings.json"
@@ -145,7 +145,7 @@ class Steps:
         self.taken.setdefault(kind, []).append(took)
         self.ahead[kind] = max(0, self.ahead[kind] - 1)
         if file is not None:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            (file.parent / SETTINGS).write_text(self.settings)
+            if not (file.parent / SETTINGS).exists():
+                write_whole(file.parent / SETTINGS, self.settings.encode())
             write_plain(file, Kept(took, result), self.kinds, self.shared)
         return result

@@ -24,7 +24,7 @@ from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
 
 Progress = Callable[[int, int], None]
-WORTH = 0.1  # nats a parameter that another round must gain, or surfels that are divided
+WORTH = 0.05  # nats a parameter that another round must gain, or surfels that are divided
 PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "lays", "history", "losses")
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 

@@ -6,6 +6,7 @@ import json
 import os
 import re
 import shlex
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -29,6 +30,7 @@ HOLDS = MappingProxyType(
         OVERRIDES: "an interrupted run",
     }
 )
+LEAST = 2**18  # bytes, of what a command writes before it knows how much it will write
 LONGEST_NAME = 64  # characters of a capture's name
 # Processes that help another with its run have a number above 0 in one of these.
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
@@ -85,9 +87,15 @@ def take_given_folder(arguments: list[str]) -> None:
     given = given_values(arguments)
     folder = Path(given.get("hydra.run.dir", OUTPUTS))
     there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        found = "cannot be written to" if there.is_dir() else "is no folder"
-        raise UserError(f"{there} {found}; give another folder for the results: hydra.run.dir=FOLDER")
+    try:
+        with tempfile.TemporaryFile(dir=there) as probe:  # the disk may be full, or no disk at all (/proc)
+            probe.write(bytes(LEAST))
+            probe.flush()
+    except OSError as error:
+        found = f"cannot be written to ({error.strerror})" if there.is_dir() else "is no folder"
+        raise UserError(
+            f"{there} {found}; give another folder for the results: hydra.run.dir=FOLDER"
+        ) from error
     if "hydra.run.dir" in given and folder.is_dir():
         take_folder(folder, goes_on_in(folder, given.get("ckpt_path")))
 

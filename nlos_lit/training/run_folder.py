@@ -108,7 +108,7 @@ def prepare_run(
     """
     began = time.perf_counter()
     scene, seed = config["scene"], int(config["seed"])
-    capture, truth = load_scene(scene, config["data_dir"], seed)
+    capture, truth = load_scene(scene, config["data_dir"], seed, config["force"])
     origin = origin_of(config, capture)
     for file, sections in opens.items():
         check_origin(file, origin, sections)

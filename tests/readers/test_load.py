@@ -70,7 +70,7 @@ def test_values_that_no_sum_of_squares_holds_are_refused(tmp_path, largest):
     counts = np.full((12, 10), 1e-3 * largest)
     counts[0, 0] = largest
     write_capture(tmp_path / "a.hdf5", Capture(**fields(counts=counts, is_counts=False)))
-    with pytest.raises(UserError, match=r"the capture's largest value is .*; what is computed of values"):
+    with pytest.raises(UserError, match=r"the capture's largest value is .*what is computed of values"):
         load_scene(scene("capture", f"scene.path={tmp_path}/a.hdf5"), tmp_path, seed=0)
 
 

@@ -8,6 +8,8 @@ import errno
 import os
 import subprocess
 import sys
+import tempfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,8 +106,17 @@ def test_results_that_have_no_place_are_refused_before_the_work(tmp_path, monkey
     (tmp_path / "taken").touch()
     with pytest.raises(UserError, match="taken is no folder; give another folder for the results"):
         take_given_folder([f"hydra.run.dir={tmp_path}/taken/run"])
-    monkeypatch.setattr(os, "access", lambda place, how: False)
-    with pytest.raises(UserError, match="cannot be written to"):
+    if Path("/proc/self").is_dir():
+        with pytest.raises(
+            UserError, match=r"/proc cannot be written to \(No such file or directory\); give"
+        ):
+            take_given_folder(["hydra.run.dir=/proc/run"])
+
+    def full(**_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", full)
+    with pytest.raises(UserError, match=r"cannot be written to \(No space left on device\); give another"):
         take_given_folder([f"hydra.run.dir={tmp_path}/run"])
     with pytest.raises(UserError, match="cannot be written to"):
         take_given_folder([])

@@ -1,0 +1,33 @@
+"""The page of robustness runs says what its rows say."""
+
+import campaign
+import pytest
+from rows import read
+
+
+def test_the_page_is_made_of_its_rows():
+    text = campaign.PAGE.read_text(encoding="utf-8")
+    assert campaign.with_rows(text, read(campaign.ROWS)) == text
+
+
+def test_a_table_counts_what_failed():
+    row = {
+        "part": "readers",
+        "format": "lct",
+        "tried": 10,
+        "read": 3,
+        "refused": 5,
+        "failures": ["a", "b", "c"],
+    }
+    told = campaign.tables([row | {"commit": "abc", "command": "x.py"}])
+    assert "| lct | 10 | 5 | 0 | 3 | 2 |" in told
+    assert "- lct: `b`" in told
+    assert "- lct: 1 more like these" in told
+    assert "`x.py` at abc" in told
+
+
+def test_every_part_names_a_script():
+    for script, *_ in campaign.PARTS:
+        assert (campaign.HERE / script).is_file()
+    with pytest.raises(FileNotFoundError):
+        read(campaign.HERE / "nothing.jsonl")
