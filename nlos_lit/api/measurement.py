@@ -137,7 +137,7 @@ class Measurement:
 
     def _surfels(self, settings: Sequence[str]) -> Surface:
         config = self._config("train", "model=surface", *settings)
-        planned = {**config, "scene": planned_scene(config["scene"], config["data_dir"])[0]}
+        planned = {**config, "scene": planned_scene(config["scene"], config["data_dir"], config["force"])[0]}
         run = prepare_run(planned)
         phasor = run.module.pipeline.phasor
         fitted = fit_surfels(
@@ -160,13 +160,13 @@ class Measurement:
         return compose(command, given)
 
     def _loaded(self, config: dict[str, Any]) -> tuple[Capture, dict[str, Any]]:
-        return self._load(json.dumps(config["scene"]), config["data_dir"], config["seed"])
+        return self._load(json.dumps(config["scene"]), config["data_dir"], config["seed"], config["force"])
 
 
-def _load(scene: str, data_dir: str, seed: int) -> tuple[Capture, dict[str, Any]]:
+def _load(scene: str, data_dir: str, seed: int, force: bool) -> tuple[Capture, dict[str, Any]]:
     """The capture, ready to fit, and its scene, planned."""
-    planned = planned_scene(json.loads(scene), data_dir)[0]
-    return load_scene(planned, data_dir, seed)[0], planned
+    planned = planned_scene(json.loads(scene), data_dir, force)[0]
+    return load_scene(planned, data_dir, seed, force)[0], planned
 
 
 def quoted(path: Path | str) -> str:

@@ -19,6 +19,7 @@ from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose as diagnose_capture
+from nlos_lit.inference.diagnose import split_of
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.report.diagnosis_figures import diagnosis_figures
 from nlos_lit.report.page import log_figures, write_report
@@ -88,6 +89,7 @@ def diagnose(config: DictConfig) -> None:
         "model": model,
         **{key: settings[key] for key in ("surfels", "criticism", "seed")},
     }
+    split_of(capture)  # what cannot be diagnosed leaves no page
     watched = WatchedDiagnosis(folder / "diagnosis", scene, capture)
     try:
         watched.begin()

@@ -20,12 +20,32 @@ from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn, crit
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
-from nlos_lit.inference.split import split_spots
+from nlos_lit.inference.split import Split, split_spots
 from nlos_lit.inference.toys import run_toys
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
 
 Progress = Callable[[tuple[Tensor, VolumeGrid], SurfelFit, SurfelFit, list[Turn]], None]
+
+
+def split_of(capture: Capture) -> Split:
+    """How a diagnosis parts the spots of a capture.
+
+    Args:
+        capture: to be diagnosed.
+
+    Returns:
+        the parts.
+
+    Raises:
+        UserError: the scan is too small to be split, or the capture holds no counts but expectations.
+    """
+    if not capture.is_counts:
+        raise UserError(
+            "a diagnosis weighs photon counts; this capture holds expected values (a render): "
+            "draw counts first"
+        )
+    return split_spots(capture)
 
 
 def diagnose(
@@ -65,12 +85,7 @@ def diagnose(
             is found, or kept steps are damaged or of other settings.
     """
     began = time.perf_counter()
-    if not capture.is_counts:
-        raise UserError(
-            "a diagnosis weighs photon counts; this capture holds expected values (a render): "
-            "draw counts first"
-        )
-    split, scan = split_spots(capture), Scan.of(capture)
+    split, scan = split_of(capture), Scan.of(capture)
     steps = Steps(report, None if folder is None else folder / "steps", settings, kinds(scan))
     steps.share({"capture": capture, "settings": pipeline.surfels})
     steps.plan(image=image is None, fit=2 + options.rivals, screen=1)

@@ -65,8 +65,10 @@ def test_settings_are_those_of_the_commands(measured):
         measured.reconstruct("lct", "scene.volume.dept=[0.5,0.8]")
     with pytest.raises(UserError, match="there is no method 'ltc'; did you mean"):
         measured.reconstruct("ltc")
-    with pytest.raises(CaptureError, match="outside the capture's time window"):
+    with pytest.raises(UserError, match="spans depths of 50 to 60 m, and light comes back from"):
         measured.reconstruct("lct", "scene.volume.depth=[50,60]")
+    with pytest.raises(CaptureError, match="outside the capture's time window"):
+        measured.reconstruct("lct", "scene.volume.depth=[50,60]", "force=true")
 
 
 def test_surfels_are_fitted(measured, tmp_path):

@@ -44,7 +44,8 @@ def test_every_method_by_one_sweep(tmp_path):
     [
         (["method=lct", "scene.simulate.scan.kind=single"], "lct needs a confocal scan"),
         (["method=bp", "memory_budget=1KiB"], "above the budget"),
-        (["method=fk", "scene.volume.depth=[4,5]"], "outside the capture's time window"),
+        (["method=fk", "scene.volume.depth=[4,5]"], "spans depths of 4 to 5 m, and light comes back from"),
+        (["method=fk", "scene.volume.depth=[4,5]", "force=true"], "outside the capture's time window"),
     ],
 )
 def test_what_cannot_work_is_one_sentence(overrides, sentence, tmp_path):

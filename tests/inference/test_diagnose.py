@@ -177,7 +177,7 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
 def test_what_cannot_be_diagnosed_is_one_sentence(tmp_path):
     render = dataclasses.replace(capture_of(raster(16), counts=np.ones((256, 64))), is_counts=False)
     write_capture(tmp_path / "render.hdf5", render)
-    own = f"scene=capture scene.volume.depth=[0.4,0.9] scene.path={tmp_path / 'render.hdf5'}"
+    own = f"scene=capture scene.volume.depth=[0.4,0.9] force=true scene.path={tmp_path / 'render.hdf5'}"
     bad = {
         f"run={tmp_path / 'nowhere'}": "run must be a file or folder that is there",
         f"run={tmp_path}": "is not the folder of a finished run: config.yaml is missing",

@@ -104,8 +104,10 @@ def test_every_part_of_the_plan_can_be_overruled(file):
 def test_darkness_is_no_depth(tmp_path):
     dark = np.random.default_rng(0).poisson(0.2, (SIDE**2, BINS)).astype(np.uint32)
     file = write_capture(tmp_path / "dark.hdf5", dataclasses.replace(point_scene(), counts=dark))
-    with pytest.raises(UserError, match=r"dark.hdf5: no light .* give them as 'scene.volume.depth="):
+    with pytest.raises(UserError, match=r"holds nothing but noise, .* \(force=true goes on\)"):
         planned_scene(composed(file)["scene"], "data")
+    with pytest.raises(UserError, match=r"dark.hdf5: no light .* give them as 'scene.volume.depth="):
+        planned_scene(composed(file)["scene"], "data", force=True)
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,9 @@ def test_effects_are_refined_along_and_open_again(finished):
 
 
 def test_a_run_without_refinement_has_no_surfels_to_load(tmp_path):
-    with pytest.raises(UserError, match=r"refined/surfels\.pt is missing; run train\.py with refine=true"):
+    with pytest.raises(
+        UserError, match=r"surfels\.pt is missing; run python train\.py with refine=true"
+    ):
         load_refined(tmp_path, None)
 
 
@@ -323,7 +325,7 @@ BAD = {
     "scene=capture": "scene.path=FILE",
     "scene=capture scene.path=/nowhere/x.mat": "must be a file or folder that is there",
     "scene.gate=[200,200]": "scene.gate must be",
-    "scene.volume.depth=[5,6]": "lies outside the capture's time window",
+    "scene.volume.depth=[5,6]": "spans depths of 5 to 6 m, and light comes back from",
     "scene.volume.depth=[0.9,0.4]": "a < b, or null; found",
     "effects=[irf_tail,pileup]": "no effect 'pileup'; did you mean pile_up",
     "memory_budget=1MiB": "the budget is",
