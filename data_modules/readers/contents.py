@@ -21,6 +21,7 @@ from data_modules.readers.mat5 import list_mat5, read_mat5
 from nlos_lit.capture.errors import CaptureError
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+LARGEST = 1e30  # of a number that is read: sums of millions of them stand in single precision
 _MOST = 4096  # arrays of a file that are listed
 _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
 
@@ -120,10 +121,10 @@ class Contents:
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
 
     def counts(self, name: str) -> np.ndarray:
-        """One array of transients: not empty and finite.
+        """One array of transients: not empty, finite, and of values whose sums stay finite.
 
         Raises:
-            CaptureError: as of `read`, or empty, or NaN or infinite values in it.
+            CaptureError: as of `read`, or empty, or NaN, infinite or such values in it.
         """
         values = self.read(name)
         if values.size == 0:
@@ -131,6 +132,12 @@ class Contents:
         if not (np.isfinite(values.min()) and np.isfinite(values.max())):
             raise CaptureError(
                 f"{name} in {self.path.name} holds NaN or infinite values; clean the file or mask those spots"
+            )
+        largest = max(abs(float(values.min())), abs(float(values.max())))
+        if largest > LARGEST:
+            raise CaptureError(
+                f"the largest value of {name} in {self.path.name} is {largest:.3g}; usual are 1 to 100000 "
+                "counts a bin: look for a damaged value, or give values in another unit"
             )
         return values
 
@@ -146,17 +153,19 @@ class Contents:
         return values
 
     def scalar(self, name: str) -> float:
-        """A finite number stored as an array of one element.
+        """A number within ±LARGEST stored as an array of one element.
 
         Raises:
-            CaptureError: as of `read`, or several values, or not finite.
+            CaptureError: as of `read`, or several values, or beyond that.
         """
         values = self.read(name)
-        if values.size != 1 or not np.isfinite(values).all():
+        if values.size != 1:
             raise CaptureError(
                 f"{name} in {self.path.name} must be one finite number; found {values.size} values"
             )
-        return float(values.reshape(()))
+        if not abs(value := float(values.reshape(()))) <= LARGEST:
+            raise CaptureError(f"{name} in {self.path.name} must be one finite number; found {value:g}")
+        return value
 
     def flag(self, name: str) -> bool:
         """A truth value, stored as true and false or as 1 and 0.

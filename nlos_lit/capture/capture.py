@@ -19,6 +19,7 @@ from nlos_lit.capture.errors import CaptureError
 
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 SHORTEST_BIN, LONGEST_BIN = 1e-9, 1e6  # m
+FARTHEST = 1e6  # m; squares of it stand in any precision
 
 Value = TypeVar("Value")
 
@@ -69,9 +70,9 @@ class Capture:
             zeros included. None means everywhere. Elsewhere ``counts`` are zero and say nothing.
 
     Raises:
-        CaptureError: shapes disagree, values are NaN, infinite or negative, everything is zero, the exposure
-            is no time, the gate is empty or none of its bins was recorded, or counts lie in bins that were
-            not recorded.
+        CaptureError: shapes disagree, values are NaN, infinite or negative, coordinates are beyond 1000 km,
+            everything is zero, the exposure is no time, the gate is empty or none of its bins was recorded,
+            or counts lie in bins that were not recorded.
 
     Examples:
         A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:
@@ -118,6 +119,10 @@ class Capture:
                 raise CaptureError(f"{name} must be [{spots}, 3], one row a spot; found shape {points.shape}")
             if not np.isfinite(points).all():
                 raise CaptureError(f"{name} holds NaN or infinite coordinates")
+            if (largest := float(np.abs(points).max())) > FARTHEST:
+                raise CaptureError(
+                    f"{name} holds coordinates of up to {largest:.3g}; they are metres, {FARTHEST:g} at most"
+                )
             object.__setattr__(self, name, points)
         for name in ("laser_normal", "sensor_normal"):
             normals = getattr(self, name)

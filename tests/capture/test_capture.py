@@ -57,6 +57,7 @@ REFUSED = {
     "repeated order": ({"scan_order": np.zeros(12, dtype=int)}, "permutation of 0 … 11"),
     "short order": ({"scan_order": np.arange(11)}, "permutation"),
     "few observed": ({"observed": np.ones((12, 9), dtype=bool)}, r"observed must be \[12, 10\].*\(12, 9\)"),
+    "a wall beyond any": ({"laser": np.full((12, 3), 1e7)}, r"laser .* up to 1e\+07; they are metres"),
     "weights for observed": ({"observed": np.ones((12, 10))}, "True and False.*float64"),
     "counts nobody recorded": ({"observed": EARLY}, "36 bins hold counts but are said not to"),
     "no gated bin recorded": (

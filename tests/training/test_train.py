@@ -170,9 +170,7 @@ def test_effects_are_refined_along_and_open_again(finished):
 
 
 def test_a_run_without_refinement_has_no_surfels_to_load(tmp_path):
-    with pytest.raises(
-        UserError, match=r"surfels\.pt is missing; run python train\.py with refine=true"
-    ):
+    with pytest.raises(UserError, match=r"surfels\.pt is missing; run python train\.py with refine=true"):
         load_refined(tmp_path, None)
 
 
