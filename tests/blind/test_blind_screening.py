@@ -28,13 +28,26 @@ UNSEEN = {
 }
 
 
-def unseen(name: str) -> list[pytest.MarkDecorator]:
-    return [pytest.mark.xfail(reason=UNSEEN[name], strict=True)] if name in UNSEEN else []
+# One for each stage of the model that effects act on, and one number a spot; the others are slow together.
+ALWAYS = (
+    "irf_tail",
+    "wall_reflectance",
+    "ambient_map",
+    "time_drift",
+    "pile_up",
+    "retroreflection",
+    "hot_spots",
+)
+
+
+def marks(name: str) -> list[pytest.MarkDecorator]:
+    rare = [] if name in ALWAYS else [pytest.mark.slow]
+    return [*rare, pytest.mark.xfail(reason=UNSEEN[name], strict=True)] if name in UNSEEN else rare
 
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=unseen(name)) for name in EFFECTS],
+    [pytest.param(name, marks=marks(name)) for name in EFFECTS],
 )
 def test_what_is_hidden_is_tried(name, tmp_path):
     scenes = EFFECTS[name].scenes
