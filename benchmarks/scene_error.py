@@ -29,11 +29,19 @@ STEEP = 0.12  # cosine of the tilt beyond which the true surface is not seen fro
 LAYER = 2  # cells along z between two sheets
 
 
-def divergence(fit, expected: np.ndarray, spots: np.ndarray) -> float:
-    """Nats by which the true ``expected`` counts ``[S, T_gate]`` of some spots lie from the fit's."""
-    true = expected[spots].astype(np.float64)
-    own = fit.model.expected(torch.from_numpy(spots), fit.extension).double().clamp_min(1e-9).numpy()
-    return float((true * np.log(np.maximum(true, 1e-12) / own) - true + own).sum())
+def expected_of(fit, spots: np.ndarray) -> np.ndarray:
+    """The fit's expected counts ``[B, T_gate]`` of some spots."""
+    return fit.model.expected(torch.from_numpy(spots), fit.extension).double().clamp_min(1e-9).numpy()
+
+
+def divergence(true: np.ndarray, own: np.ndarray) -> float:
+    """Nats by which the ``true`` expected counts ``[B, T_gate]`` lie from the fit's ``own``."""
+    return float((true * np.log(true.clip(1e-12) / own) - true + own).sum())
+
+
+def gain_over_truth(counts: np.ndarray, true: np.ndarray, own: np.ndarray) -> float:
+    """Nats by which ``counts`` are likelier under the fit's ``own`` expected ones than the ``true`` ones."""
+    return float((counts * np.log(own / true.clip(1e-9)) - own + true).sum())
 
 
 def on_surface(fit, elements, parts: int):
@@ -85,13 +93,6 @@ def scenes(pipeline, capture, split, elements):
             yield f"on the true surface, cells/{parts}", on_surface(base, elements, parts)
 
 
-def gain_over_truth(fit, expected: np.ndarray, spots: np.ndarray) -> float:
-    """Nats by which the fitted counts are likelier under the fit than under the true ``expected`` ones."""
-    true = expected[spots].astype(np.float64).clip(1e-9)
-    own = fit.model.expected(torch.from_numpy(spots), fit.extension).double().clamp_min(1e-9).numpy()
-    return float((fit.counts.double().numpy() * np.log(own / true) - own + true).sum())
-
-
 def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
     """Print one development capture's rows."""
     from blind_judge import pipeline_for
@@ -107,13 +108,15 @@ def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
         capture = read_capture(Path(folder) / "capture.hdf5", "auto")
     first, last = capture.gate
     expected = truth.expected[:, first:last] if truth.expected.shape[1] > last - first else truth.expected
+    expected = expected.astype(np.float64)
     pipeline, split = pipeline_for(capture), split_spots(capture)
     pipeline = replace(pipeline, surfels=replace(pipeline.surfels, **changed(options)))
     began = time.process_time()
     elements = truth.scene.elements if from_truth and truth.scene.own else None
     for what, fit in scenes(pipeline, capture, split, elements):
         seconds, found = time.process_time() - began, score(fit, split.select)
-        fitted, gain = divergence(fit, expected, split.fit), gain_over_truth(fit, expected, split.fit)
+        own, true = expected_of(fit, split.fit), expected[split.fit]
+        fitted, gain = divergence(true, own), gain_over_truth(fit.counts.double().numpy(), true, own)
         row = {
             "set": "development",
             "number": number,
@@ -126,7 +129,7 @@ def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
             "variance_nats": round((fitted + gain) / 2, 1),
             "bias_nats": round((fitted - gain) / 2, 1),
             "fitted_spots": len(split.fit),
-            "select_nats": round(divergence(fit, expected, split.select), 1),
+            "select_nats": round(divergence(expected[split.select], expected_of(fit, split.select)), 1),
             "select_spots": len(split.select),
             "over_noise": round(found.deviance_per_bin / found.deviance_noise, 4),
             "cpu_seconds": round(seconds, 1),

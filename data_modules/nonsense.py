@@ -53,8 +53,7 @@ def bin_width(capture: Capture) -> list[str]:
 
 def wall_extent(capture: Capture) -> list[str]:
     """A wall in millimetres or kilometres, or no wall at all."""
-    points = np.concatenate([capture.laser, capture.sensor])
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    extent = capture.wall_extent
     if extent < WIDEST and (extent > NARROWEST or capture.n_spots == 1):
         return []
     return [

@@ -67,8 +67,7 @@ def gate_and_pulse(capture: Capture) -> list[str]:
 
 def distances(capture: Capture) -> list[str]:
     """Lengths that no scene and no wall has: wrong units, usually."""
-    points = np.concatenate([capture.laser, capture.sensor])
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    extent = capture.wall_extent
     told = []
     if extent > 10 or extent < 0.02:
         told.append(f"the wall is {extent:.3g} m across; check wall_size")

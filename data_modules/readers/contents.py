@@ -18,6 +18,7 @@ import numpy as np
 import psutil
 
 from data_modules.readers.mat5 import list_mat5, read_mat5
+from nlos_lit.capture.capture import FARTHEST
 from nlos_lit.capture.errors import CaptureError
 
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -148,7 +149,7 @@ class Contents:
             CaptureError: as of `read`, or other values.
         """
         values = self.read(name).astype(np.float64)
-        if values.size == 0 or not np.abs(values).max() < 1e6:
+        if values.size == 0 or not np.abs(values).max() < FARTHEST:
             raise CaptureError(f"{name} in {self.path.name} must hold finite coordinates in metres")
         return values
 

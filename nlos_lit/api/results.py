@@ -128,11 +128,10 @@ class Picture(Result):
         )
 
     def save(self, folder: Path | str) -> Path:
-        """Write ``volume.h5``, ``points.ply``, ``mesh.ply`` and ``volume.png``."""
+        """Write ``volume.h5``, ``points.ply``, ``mesh.ply``, ``mesh.glb`` and ``volume.png``."""
         folder = Path(folder)
         write_volume(folder / "volume.h5", self.values, self.grid)
-        write_points(folder / "points.ply", self.points)
-        write_mesh(folder / "mesh.ply", self.points, depth=OCTREE)
+        _save_points(self.points, folder)
         save_figure(self.figure(), folder / "volume.png")
         return folder
 
@@ -170,10 +169,9 @@ class Surface(Result):
         return figures.surface_plot(self.points)
 
     def save(self, folder: Path | str) -> Path:
-        """Write ``points.ply``, ``mesh.ply`` and ``surface.png``."""
+        """Write ``points.ply``, ``mesh.ply``, ``mesh.glb`` and ``surface.png``."""
         folder = Path(folder)
-        write_points(folder / "points.ply", self.points)
-        write_mesh(folder / "mesh.ply", self.points, depth=OCTREE)
+        _save_points(self.points, folder)
         save_figure(self.figure(), folder / "surface.png")
         return folder
 
@@ -203,3 +201,8 @@ class Diagnosed(Result):
         """Write the report's page, ``diagnosis.json`` and all figures."""
         write_report(self.diagnosis, folder)
         return Path(folder)
+
+
+def _save_points(points: Points, folder: Path) -> None:
+    write_points(folder / "points.ply", points)
+    write_mesh(folder / "mesh.ply", points, depth=OCTREE)

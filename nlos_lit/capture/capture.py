@@ -174,6 +174,11 @@ class Capture:
         return self.counts.shape[1]
 
     @property
+    def wall_extent(self) -> float:
+        """Diagonal of the box around all laser and sensor points, m."""
+        return float(np.linalg.norm(np.ptp(np.concatenate([self.laser, self.sensor]), axis=0)))
+
+    @property
     def confocal(self) -> bool:
         """Laser and sensor look at the same wall point at every spot (within a hundredth of a bin)."""
         return bool(np.abs(self.laser - self.sensor).max() < 0.01 * self.bin_length)

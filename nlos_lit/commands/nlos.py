@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import os
 import sys
@@ -112,9 +111,9 @@ def main(arguments: list[str] | None = None) -> int:
         print(nlos_lit.__version__)
         return 0
     if name not in COMMANDS:
-        near = difflib.get_close_matches(name, COMMANDS, n=2)
-        instead = f"did you mean {' or '.join(near)}?" if near else f"there are {', '.join(COMMANDS)}"
-        print(f"error: there is no command {name!r}; {instead}", file=sys.stderr)
+        from nlos_lit.capture.errors import suggest  # loads numpy
+
+        print(f"error: there is no command {name!r}; {suggest(name, COMMANDS)}", file=sys.stderr)
         return 2
     os.environ[STARTED] = name
     return open_command(name, given[1:])

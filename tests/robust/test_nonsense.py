@@ -83,7 +83,8 @@ def test_no_real_capture_is_refused(name, given):
 @pytest.mark.parametrize("name", ["default", "letters"])
 def test_no_embedded_scene_is_refused(name, seed):
     size = ["scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12"]
-    load_scene(compose("train", [f"scene={name}", *size])["scene"], ".", seed)
+    capture, _ = load_scene(compose("train", [f"scene={name}", *size])["scene"], ".", seed)
+    assert nonsense(capture) == []
 
 
 @pytest.mark.parametrize("photons", [1, 3, 30, 1000])

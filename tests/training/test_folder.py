@@ -46,6 +46,7 @@ def test_processes_that_help_take_no_folder(tmp_path, monkeypatch):
     (tmp_path / OVERRIDES).touch()
     monkeypatch.setenv("LOCAL_RANK", "1")
     take_folder(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == [OVERRIDES]  # no lock either
 
 
 def test_a_run_goes_on_in_its_own_folder_alone(tmp_path):
