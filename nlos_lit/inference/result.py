@@ -57,6 +57,23 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Followed:
+    """The formula that comes nearest to a free term, see :mod:`nlos_lit.inference.distil`.
+
+    Args:
+        name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
+        share: of the free term's gain on spots that were not fitted.
+        offered: it keeps enough to be an effect of its own.
+    """
+
+    name: str
+    equation: str
+    parameters: dict[str, Estimate]
+    share: float
+    offered: bool
+
+
+@dataclass(frozen=True)
 class Accepted:
     """A term that the model was extended with: an effect of the registry, or a free term.
 
@@ -67,7 +84,7 @@ class Accepted:
             what weighs too little is left out.
         split_by: the measurement that would tell those apart.
         axis: of a free term, else empty.
-        shape: of a free term.
+        shape: of a free term. formula: that it follows best; None where none was asked for.
         needed: nats of evidence that this term needed; None for those of all others.
     """
 
@@ -79,6 +96,7 @@ class Accepted:
     split_by: str = ""
     axis: str = ""
     shape: Shape | None = None
+    formula: Followed | None = None
     needed: float | None = None
 
     @property

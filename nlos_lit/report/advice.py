@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from nlos_lit.inference.criticise import Turn
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.report.quantities import number, percent
-from nlos_lit.report.verdict import at_noise, excess_share, invisible, rivals
+from nlos_lit.report.verdict import at_noise, excess_share, follows, invisible, rivals
 from nlos_lit.report.words import describe
 
 # What tells where something without a name comes from, by the axis that it lies along.
@@ -105,9 +105,10 @@ def next_step(diagnosis: Diagnosis, scene: Sequence[str] = ()) -> Advice:
         return Advice(f"{remedy}{more} Or leave the rig as it is and put it into the model:", known)
     if diagnosis.unknown:
         worst = max(diagnosis.unknown, key=_gain)
+        known = f" {follows(worst)}" if worst.formula is not None and worst.formula.offered else ""
         return Advice(
             f"{TELLS.get(worst.axis, FINDER)} Until it has a name, read the picture with care where the"
-            " residual below stands out."
+            f" residual below stands out.{known}"
         )
     refined = shlex.join([*base, "refine=true"])
     if at_noise(diagnosis):

@@ -14,17 +14,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from nlos_lit.inference.result import Accepted, Diagnosis
+from nlos_lit.effects.formulas import FORMULAS, written
+from nlos_lit.inference.result import Accepted, Diagnosis, Followed
 from nlos_lit.io.files import whole_file, write_json
 from nlos_lit.report.advice import confidence, next_step
 from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
 from nlos_lit.report.glossary import glossary_list, glossed
 from nlos_lit.report.page_style import CSS
-from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, quantity
+from nlos_lit.report.quantities import NONE, amount, amount_of, headline, number, percent, quantity
 from nlos_lit.report.style import save_figure
 from nlos_lit.report.verdict import (
     at_noise,
     barely,
+    follows,
     invisible,
     misfit,
     missing,
@@ -74,7 +76,7 @@ def write_report(
     extra_figures: Mapping[str, Figure] | None = None,
     scene: Sequence[str] = (),
 ) -> Path:
-    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png``.
+    """Write ``report.html`` (all in one file), ``diagnosis.json``, ``figures/*.png`` and offered effects.
 
     Args:
         diagnosis: that is shown.
@@ -99,12 +101,24 @@ def write_report(
         save_figure(figure, path)
         images[name] = _image(name, path.read_bytes())
     write_json(folder / "diagnosis.json", diagnosis.to_dict())
+    for term in diagnosis.unknown:
+        if term.formula is not None and term.formula.offered:
+            _write_effect(term.formula, diagnosis, folder / "effects")
     page = folder / "report.html"
     with whole_file(page) as partial:
         explorable = (folder / "explore.html").is_file()
         text = report_html(diagnosis, images, list(extra), scene, explorable)
         partial.write_text(text, encoding="utf-8")
     return page
+
+
+def _write_effect(formula: Followed, diagnosis: Diagnosis, folder: Path) -> None:
+    """The file of a formula that a free term follows, as an effect of its own."""
+    share, size = percent(formula.share), headline(formula.name, formula.parameters)
+    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of a free term's gain."
+    kind = next(each for each in FORMULAS if each.name == formula.name)
+    with whole_file(folder / f"{formula.name}.py") as partial:
+        partial.write_text(written(kind, found), encoding="utf-8")
 
 
 def log_figures(folder: Path | str, figures: Mapping[str, Figure]) -> None:
@@ -316,7 +330,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         "A free term is a correction without a name, of any form along its axis."
         f" The most evidence is {held}."
     )
-    return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown)
+    told = "".join(f"<p>{_text(follows(term))}</p>" for term in diagnosis.unknown)
+    return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown) + told
 
 
 def _scores(diagnosis: Diagnosis) -> str:

@@ -132,6 +132,7 @@ def test_json_is_the_diagnosis(written, case):
             "split_by",
             "axis",
             "shape",
+            "formula",
             "needed",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
