@@ -18,15 +18,14 @@ from nlos_lit.baselines import METHODS, reconstruct_directed
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
-from nlos_lit.model.build import PipelineSettings
 from nlos_lit.runtime.arguments import check_overrides
+from nlos_lit.runtime.command_line import quoted
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels
-from nlos_lit.training.configs import compose, settings_of
+from nlos_lit.training.configs import compose, pipeline_of, settings_of
 from nlos_lit.training.run_folder import prepare_run
 
 PHASOR, SURFELS = "phasor", "surfels"
@@ -125,12 +124,7 @@ class Measurement:
         """
         config = self._config("diagnose", *settings)
         capture, scene = self._loaded(config)
-        pipeline = BasePipeline(
-            volume=scene["volume"],
-            model=settings_of(PipelineSettings, config["model"], "model"),
-            surfels=settings_of(SurfelSettings, config["surfels"], "surfels"),
-            budget=parse_bytes(config["memory_budget"]),
-        )
+        pipeline = pipeline_of(config, scene, config["model"])
         options = settings_of(CriticismSettings, config["criticism"], "criticism")
         found, _ = diagnose(capture, pipeline, options, name=self.name, seed=config["seed"])
         return Diagnosed(self.name, found)
@@ -167,16 +161,3 @@ def _load(scene: str, data_dir: str, seed: int, force: bool) -> tuple[Capture, d
     """The capture, ready to fit, and its scene, planned."""
     planned = planned_scene(json.loads(scene), data_dir, force)[0]
     return load_scene(planned, data_dir, seed, force)[0], planned
-
-
-def quoted(path: Path | str) -> str:
-    """A path as a value on Hydra's command line.
-
-    Examples:
-        >>> quoted("data/a.mat"), quoted("our lab's.mat")
-        ('data/a.mat', "'our lab\\\\'s.mat'")
-    """
-    text = str(path)
-    if all(c.isalnum() or c in "/._-" for c in text) and text.isascii():
-        return text
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -46,6 +46,15 @@ random=7 (docs/simulator.md). With physical effects, each with strengths as EFFE
 
     nlos simulate scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5
 """
+DIAGNOSE = """\
+Where it leaves two names open, the report says which further capture would tell. Taken, it is asked by
+
+    nlos diagnose RUN --split-with FILE
+
+RUN is the folder of the first diagnosis (or the first capture's file, which is diagnosed first). The second
+capture is read as the first was; settings of the scene that differ are given behind it, such as
+scene.reader.scan_order=columns.
+"""
 RESULTS = """\
 Names are experiments, all, or page, which rewrites the generated parts of docs/results.md from what is
 stored.
@@ -62,14 +71,15 @@ COMMANDS = MappingProxyType(
             "look at a capture file: recognise, check, plan and picture it, and say what to do next",
             "FILE",
         ),
-        "train": Command("reconstruct a hidden scene by self-calibration", "scene=su", settings=True),
+        "train": Command("reconstruct a hidden scene by self-calibration", "FILE", settings=True),
         "diagnose": Command(
-            "say what the simulation gets wrong about a capture, or about a finished run (run=FOLDER)",
-            "scene=su",
+            "say what the simulation gets wrong about a capture, or about a finished run",
+            "FILE",
+            more=DIAGNOSE,
             settings=True,
         ),
         "reconstruct": Command(
-            "reconstruct by a classical method, without fitting", "scene=su method=lct", settings=True
+            "reconstruct by a classical method, without fitting", "FILE method=lct", settings=True
         ),
         "simulate": Command(
             "simulate a capture of a hidden scene",
@@ -132,7 +142,9 @@ def open_command(name: str, arguments: list[str]) -> int:
     command = COMMANDS[name]
     if command.settings:
         from nlos_lit.runtime.arguments import look_over
+        from nlos_lit.runtime.command_line import sentence_errors, words_as_settings
 
+        arguments = sentence_errors(words_as_settings)(name, arguments)
         look_over(name, arguments, command.about)
     module = importlib.import_module(f"nlos_lit.commands.{command.module or name}")
     status: int = module.main(arguments)

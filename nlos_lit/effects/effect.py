@@ -36,6 +36,8 @@ class Effect(nn.Module, Hooks):
             what is reported.
         in_runs: of such an effect, neighbouring spots may share their numbers. Otherwise only what a spot has
             over its neighbours counts.
+        lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
+            it with the same values.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
         needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
@@ -48,6 +50,7 @@ class Effect(nn.Module, Hooks):
     witness: ClassVar[Literal["energy", "tail", "delay"] | None] = None
     per_spot: ClassVar[bool] = False
     in_runs: ClassVar[bool] = False
+    lasting: ClassVar[bool] = False
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False

@@ -12,12 +12,13 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import RATES, Free
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.heldout import Comparison, score
 from nlos_lit.inference.pool import Candidate, tested_rows
 from nlos_lit.inference.residuals import SIDE, profiles
-from nlos_lit.inference.result import Accepted, Diagnosis, Gain, Screened, Shape, Unexplained
+from nlos_lit.inference.result import Accepted, Diagnosis, Gain, Screened, Shape, Tried, Unexplained
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty
@@ -85,7 +86,7 @@ def assemble(
         if null is None
         else null.chance(largest),
         notes=[],
-        capture=_facts(capture, name),
+        capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
@@ -113,7 +114,38 @@ def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Spli
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
         needed=confirmed.needed,
+        tried={name: _tried(name, turn.trials, split) for name in weights},
     )
+
+
+def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
+    trial = next(t for t in trials if t.name == name)
+    none = next(t for t in trials if t.candidate is None)
+    effect = next(e for e in trial.fit.extension.effects if e.name == name)
+    return Tried(nats_by_block(none.likelihood, trial.likelihood, split), lasting_values(effect))
+
+
+def lasting_values(effect: Effect) -> dict[str, list[float]]:
+    """What another capture of the same wall has alike, as :attr:`Tried.values`."""
+    if not effect.lasting:
+        return {}
+    return {name: effect.value(name).detach().reshape(-1).tolist() for name in effect.declared}
+
+
+def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
+    """What one fit gains over another on each block of select spots.
+
+    Args:
+        before: ``[S]`` nats of the select spots.
+        after: ``[S]`` of the same.
+        split: of the spots.
+
+    Returns:
+        One number a block.
+    """
+    names, index = np.unique(split.block[split.select], return_inverse=True)
+    gain = torch.zeros(len(names), dtype=torch.float64)
+    return gain.index_add_(0, torch.from_numpy(index), (after - before).double()).tolist()
 
 
 def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
@@ -216,9 +248,11 @@ def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
     return (total / spots[:, None]).numpy()
 
 
-def _facts(capture: Capture, name: str) -> dict[str, Any]:
+def facts_of(capture: Capture, name: str) -> dict[str, Any]:
     first, last = capture.gate
     order = capture.scan_order
+    points = capture.sensor if np.ptp(capture.sensor, axis=0).max() > 0 else capture.laser
+    low, high = points.min(axis=0), points.max(axis=0)
     return {
         "name": name,
         "kind": capture.kind,
@@ -226,6 +260,7 @@ def _facts(capture: Capture, name: str) -> dict[str, Any]:
         "bins": capture.n_bins,
         "bin_length": capture.bin_length,
         "bin_width_ps": capture.bin_width_ps,
+        "wall": [round(float(v), 4) for v in (low[0], high[0], low[1], high[1])],
         "counts_per_spot": float(capture.counts[:, first:last].sum() / capture.n_spots),
         "gate": list(capture.gate),
         "scan_order": "raster" if np.array_equal(order, np.arange(len(order))) else "as given",
