@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, cast
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from data_modules.load import load_scene, planned_scene
+from data_modules.load import load_scene, planned_scene, read_scene
 from nlos_lit.capture import Capture
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import split_of
@@ -64,8 +64,9 @@ def second_capture(settings: dict[str, Any], folder: Path | None) -> Second:
     path = settings["split_with"]
     own = {"path": path, "name": file_name(path), "simulate": None, "truth": None}
     given = cast(dict[str, Any], OmegaConf.to_container(scene)) | own
-    planned = planned_scene(given, settings["data_dir"], settings["force"])[0]
-    capture = load_scene(planned, settings["data_dir"], settings["seed"], settings["force"])[0]
+    raw = read_scene(given, settings["data_dir"])
+    planned = planned_scene(given, settings["data_dir"], settings["force"], raw)[0]
+    capture = load_scene(planned, settings["data_dir"], settings["seed"], settings["force"], raw)[0]
     split_of(capture)
     return Second(planned, kept["model"], capture)
 

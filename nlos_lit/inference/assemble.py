@@ -12,7 +12,6 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
-from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import RATES, Free
 from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.heldout import Comparison, score
@@ -121,15 +120,32 @@ def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Spli
 def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
     trial = next(t for t in trials if t.name == name)
     none = next(t for t in trials if t.candidate is None)
-    effect = next(e for e in trial.fit.extension.effects if e.name == name)
-    return Tried(nats_by_block(none.likelihood, trial.likelihood, split), lasting_values(effect))
+    assert trial.candidate is not None
+    return tried_with(trial.candidate, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
 
 
-def lasting_values(effect: Effect) -> dict[str, list[float]]:
-    """What another capture of the same wall has alike, as :attr:`Tried.values`."""
+def tried_with(candidate: Candidate, fit: SurfelFit, nats: list[float]) -> Tried:
+    """What is kept of a term that was tried.
+
+    Args:
+        candidate: as the pool saw it.
+        fit: that went on with it.
+        nats: of each wall block.
+
+    Returns:
+        The record; with values where another capture of the same wall has them alike.
+    """
+    effect = next(e for e in fit.extension.effects if e.name == candidate.name)
     if not effect.lasting:
-        return {}
-    return {name: effect.value(name).detach().reshape(-1).tolist() for name in effect.declared}
+        return Tried(nats)
+    sizes = [p.size for p in effect.amplitudes]
+    errors = [
+        (p.scale * part.float()).tolist()
+        for p, part in zip(effect.amplitudes, candidate.error.split(sizes), strict=True)
+    ]
+    names = [p.name for p in effect.amplitudes]
+    values = {name: effect.value(name).detach().reshape(-1).tolist() for name in names}
+    return Tried(nats, values, dict(zip(names, errors, strict=True)))
 
 
 def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:

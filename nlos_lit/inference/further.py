@@ -2,13 +2,13 @@
 
 Each capture has a scene of its own, and only the names that are open are tried. What each gains over none of
 them, on wall blocks that were not fitted, is added to what it gained on the captures before. A term that
-belongs to the wall or the rig keeps the values that it had: one that is another map in every capture is no
-map of the wall.
+belongs to the wall or the rig keeps, within their errors, the values that it had: one that is another map in
+every capture is no map of the wall.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -23,12 +23,12 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.assemble import facts_of, lasting_values, nats_by_block
+from nlos_lit.inference.assemble import facts_of, nats_by_block, tried_with
 from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings, begun_with, copy_effects, go_on, solve_spots
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.heldout import log_likelihood, weights
-from nlos_lit.inference.pool import ask, lit_by, tested_rows
+from nlos_lit.inference.pool import Candidate, ask, lit_by, tested_rows
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Further, Tried
 from nlos_lit.inference.split import Split
@@ -140,19 +140,22 @@ class _Asking:
         names, select = list(term.weights), self.split.select
         held = [n for n in names if self.same and term.tried[n].values]
         none = self._gone_on("none", begun_with(self.base, []))
-        fits = {n: self._gone_on(n, begun) for n, begun in self._begun(term, names, held).items()}
+        asked = {c.name: c for c in self._asked([n for n in names if n not in held])}
+        begun = {n: begun_with(self.base, [c]) for n, c in asked.items()}
+        for n in held:
+            known = _effect(n, self.scan, term.tried[n])
+            begun[n] = copy_effects(self.base.extension, [known])
+        fits = {n: self._gone_on(n, begun[n]) for n in names}
         before = log_likelihood(none, select)
         after = {n: log_likelihood(fit, select) for n, fit in fits.items()}
         best = max(after.values(), key=lambda value: float(value.sum()))
         seen = weights([before, best], self.split.block[select])[0] <= self.options.open_share
         here = {n: nats_by_block(before, value, self.split) for n, value in after.items()}
-        tried = {
-            n: Tried(
-                [*term.tried[n].nats, *here[n]],
-                term.tried[n].values if n in held else lasting_values(_own(fits[n], n)),
-            )
-            for n in names
-        }
+        tried = {}
+        for n in names:
+            nats = [*term.tried[n].nats, *here[n]]
+            again = replace(term.tried[n], nats=nats)
+            tried[n] = again if n in held else tried_with(asked[n], fits[n], nats)
         share = _weights(tried)
         left = {n: w for n, w in share.items() if w > self.options.open_share}
         first = term.name if term.name in left else max(left, key=lambda n: left[n])
@@ -165,22 +168,16 @@ class _Asking:
         )
         if first != term.name:
             stays = replace(stays, name=first, parameters=self._parameters(fits[first], first))
-        nats = {n: sum(values) for n, values in here.items()}
-        return stays, Further(name, names, nats, held, seen, share, order)
+        gained = {n: float(sum(values)) for n, values in here.items()}
+        return stays, Further(name, names, gained, held, seen, share, order)
 
-    def _begun(self, term: Accepted, names: list[str], held: list[str]) -> dict[str, Extension]:
-        """Each name beside the base, with the values that it had where these last, else as the pool does."""
-        free = [n for n in names if n not in held]
-        found = {}
-        if free:
-            lit = lit_by(self.base, self.scan)
-            asking = partial(ask, self.base, self.split, lit, self.options.spots, self.seed, free)
-            for candidate in self.steps("screen", "asking for what is open", "pool", asking):
-                found[candidate.name] = begun_with(self.base, [candidate])
-        for n in held:
-            kept = _effect(n, self.scan, term.tried[n].values)
-            found[n] = copy_effects(self.base.extension, [kept])
-        return {n: found[n] for n in names}
+    def _asked(self, names: list[str]) -> list[Candidate]:
+        """Names whose values are fitted anew, as the pool sees them here."""
+        if not names:
+            return []
+        lit = lit_by(self.base, self.scan)
+        asking = partial(ask, self.base, self.split, lit, self.options.spots, self.seed, names)
+        return self.steps("screen", "asking for what is open", "pool", asking)
 
     def _gone_on(self, name: str, extension: Extension) -> SurfelFit:
         fit = self.base.copy(extension, self.seed)
@@ -190,7 +187,8 @@ class _Asking:
         rows = tested_rows(fit, self.split, self.options.spots, self.seed)
         spots = self.split.fit[rows]
         given = (torch.from_numpy(spots), fit.counts[rows], torch.from_numpy(self.split.block[spots]))
-        return Uncertainty(fit, *given, len(rows) / len(self.split.fit)).parameters(_own(fit, name))
+        effect = next(e for e in fit.extension.effects if e.name == name)
+        return Uncertainty(fit, *given, len(rows) / len(self.split.fit)).parameters(effect)
 
 
 def _weights(tried: Mapping[str, Tried]) -> dict[str, float]:
@@ -200,24 +198,23 @@ def _weights(tried: Mapping[str, Tried]) -> dict[str, float]:
 
 
 def _begun(term: Accepted, scan: Scan, same: bool) -> Effect:
-    """An accepted term in another capture: with its values where these last, else at its null."""
-    values = term.tried[term.name].values if same and term.name in term.tried else {}
-    return _effect(term.name, scan, values)
+    """An accepted term in another capture: from its values where these last, else from its null."""
+    return _effect(term.name, scan, term.tried.get(term.name, Tried([])) if same else Tried([]))
 
 
-def _effect(name: str, scan: Scan, values: Mapping[str, Sequence[float]]) -> Effect:
-    """An effect that keeps values that were given, or at its null and free where there are none."""
+def _effect(name: str, scan: Scan, known: Tried) -> Effect:
+    """An effect that begins where other captures found it, or at its null where nothing is known.
+
+    Raises:
+        UserError: the other scan gives it other coefficients.
+    """
     effect = next(cls for cls in [*EFFECTS, *FREE] if cls.name == name)(scan)
-    for parameter, value in values.items():
-        given = torch.tensor(value, dtype=torch.float32)
-        if len(given) != effect.declared[parameter].size:
-            raise UserError(f"the captures are too different: {name} has other coefficients in the second")
-        effect.set(parameter, given)
-    return effect.requires_grad_(not values and not effect.per_spot)
-
-
-def _own(fit: SurfelFit, name: str) -> Effect:
-    return next(e for e in fit.extension.effects if e.name == name)
+    for parameter, values in known.values.items():
+        value, error = (torch.tensor(v) for v in (values, known.errors[parameter]))
+        if len(value) != effect.declared[parameter].size:
+            raise UserError(f"the scans are too different: {name} has other coefficients in the second")
+        effect.begin_at(parameter, value, error)
+    return effect.requires_grad_(not effect.per_spot)
 
 
 def _with(diagnosis: Diagnosis, before: Accepted, after: Accepted, further: Further) -> Diagnosis:

@@ -67,11 +67,13 @@ class Tried:
 
     Args:
         nats: gained over none, one number for each held-out wall block of each capture.
-        values: of its parameters, by name, in their units; none where each spot has its own.
+        values: of its amplitudes, by name, in their units, if they are the same in other captures.
+        errors: of these.
     """
 
     nats: list[float]
     values: dict[str, list[float]] = field(default_factory=dict)
+    errors: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -164,7 +166,7 @@ class Further:
         name: of that capture.
         asked: names that were open, the accepted one first.
         nats: what each gains there over none of them, on wall blocks that were not fitted.
-        held: names whose values were taken from before, not fitted anew.
+        held: names whose values were to stay, within their errors, what they were before.
         seen: that capture asks for any of them by itself.
         weights: of all captures together, by name.
         stays: names that are left, the accepted one first.

@@ -51,7 +51,9 @@ def rows(further: Further) -> list[list[str]]:
         [
             f"{describe(name).phrase} ({name})",
             f"{number(further.nats[name])}",
-            "those found before" if name in further.held else f"fitted to {further.name}",
+            "those found before, within their errors"
+            if name in further.held
+            else f"fitted to {further.name}",
             percent(further.weights[name], 2),
             "stays" if name in further.stays else "ruled out",
         ]

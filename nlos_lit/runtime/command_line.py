@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import logging
+import os
 import re
 import sys
 import warnings
@@ -155,10 +156,10 @@ def words_as_settings(command: str, arguments: list[str]) -> list[str]:
         return arguments
     first, rest = arguments[:1], arguments[1:]
     if first and not first[0].startswith(("-", "~", "+")) and "=" not in first[0]:
-        path = Path(first[0])
-        if not path.exists():
+        path = first[0]
+        if not os.path.exists(path):
             raise UserError(f"{path} does not exist; give a capture file, or settings KEY=VALUE: --help")
-        is_run = command == "diagnose" and (path / "config.yaml").is_file()
+        is_run = command == "diagnose" and os.path.exists(os.path.join(path, "config.yaml"))
         first = [f"run={quoted(path)}"] if is_run else ["scene=capture", f"scene.path={quoted(path)}"]
     if command != "diagnose":
         return first + rest
