@@ -16,12 +16,21 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.distil import Follower
 from nlos_lit.inference.heldout import Comparison, score
 from nlos_lit.inference.pool import Candidate, tested_rows
 from nlos_lit.inference.residuals import SIDE, profiles
-from nlos_lit.inference.result import Accepted, Diagnosis, Followed, Gain, Screened, Shape, Unexplained
+from nlos_lit.inference.result import (
+    Accepted,
+    Diagnosis,
+    Followed,
+    Gain,
+    Screened,
+    Shape,
+    Tried,
+    Unexplained,
+)
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty
@@ -96,7 +105,7 @@ def assemble(
         if null is None
         else null.chance(largest),
         notes=[],
-        capture=_facts(capture, name),
+        capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
@@ -139,7 +148,55 @@ def _accepted(
         shape=shape_of(free, scan) if free else None,
         formula=followed.get(effect.name),
         needed=confirmed.needed,
+        tried={name: _tried(name, turn.trials, split) for name in weights},
     )
+
+
+def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
+    trial = next(t for t in trials if t.name == name)
+    none = next(t for t in trials if t.candidate is None)
+    assert trial.candidate is not None
+    return tried_with(trial.candidate, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
+
+
+def tried_with(candidate: Candidate, fit: SurfelFit, nats: list[float]) -> Tried:
+    """What is kept of a term that was tried.
+
+    Args:
+        candidate: as the pool saw it.
+        fit: that went on with it.
+        nats: of each wall block.
+
+    Returns:
+        The record; with values where another capture of the same wall has them alike.
+    """
+    effect = next(e for e in fit.extension.effects if e.name == candidate.name)
+    if not effect.lasting:
+        return Tried(nats)
+    sizes = [p.size for p in effect.amplitudes]
+    errors = [
+        (p.scale * part.float()).tolist()
+        for p, part in zip(effect.amplitudes, candidate.error.split(sizes), strict=True)
+    ]
+    names = [p.name for p in effect.amplitudes]
+    values = {name: effect.value(name).detach().reshape(-1).tolist() for name in names}
+    return Tried(nats, values, dict(zip(names, errors, strict=True)))
+
+
+def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
+    """What one fit gains over another on each block of select spots.
+
+    Args:
+        before: ``[S]`` nats of the select spots.
+        after: ``[S]`` of the same.
+        split: of the spots.
+
+    Returns:
+        One number a block.
+    """
+    names, index = np.unique(split.block[split.select], return_inverse=True)
+    gain = torch.zeros(len(names), dtype=torch.float64)
+    return gain.index_add_(0, torch.from_numpy(index), (after - before).double()).tolist()
 
 
 def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
@@ -242,9 +299,11 @@ def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
     return (total / spots[:, None]).numpy()
 
 
-def _facts(capture: Capture, name: str) -> dict[str, Any]:
+def facts_of(capture: Capture, name: str) -> dict[str, Any]:
     first, last = capture.gate
     order = capture.scan_order
+    points = capture.sensor if np.ptp(capture.sensor, axis=0).max() > 0 else capture.laser
+    low, high = points.min(axis=0), points.max(axis=0)
     return {
         "name": name,
         "kind": capture.kind,
@@ -252,6 +311,7 @@ def _facts(capture: Capture, name: str) -> dict[str, Any]:
         "bins": capture.n_bins,
         "bin_length": capture.bin_length,
         "bin_width_ps": capture.bin_width_ps,
+        "wall": [round(float(v), 4) for v in (low[0], high[0], low[1], high[1])],
         "counts_per_spot": float(capture.counts[:, first:last].sum() / capture.n_spots),
         "gate": list(capture.gate),
         "scan_order": "raster" if np.array_equal(order, np.arange(len(order))) else "as given",

@@ -266,6 +266,20 @@ def solve_spots(fit: SurfelFit) -> SurfelFit:
     return fit
 
 
+def go_on(fit: SurfelFit) -> SurfelFit:
+    """Some more batches, at falling rates.
+
+    Args:
+        fit: that goes on, in place.
+
+    Returns:
+        the same fit.
+    """
+    solve_spots(fit)
+    fit.run(1, steps=WARM, settle=False)
+    return solve_spots(fit)
+
+
 class Loop:
     """All turns of one capture.
 
@@ -434,7 +448,7 @@ class Loop:
             for text, make in (
                 (
                     f"with {name}",
-                    lambda: self.go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
+                    lambda: go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
                 ),
                 (f"without {name}", lambda: self.warm(fine, [])),
             )
@@ -508,26 +522,12 @@ class Loop:
         Returns:
             another fit.
         """
-        return self.go_on(fit.copy(begun_with(fit, extra), self.seed))
+        return go_on(fit.copy(begun_with(fit, extra), self.seed))
 
     def _without(self, fit: SurfelFit, name: str) -> SurfelFit:
         """The same scene, gone on without a term."""
         fewer = [e for e in copy_effects(fit.extension, []).effects if e.name != name]
-        return self.go_on(fit.copy(Extension(fewer), self.seed))
-
-    @staticmethod
-    def go_on(fit: SurfelFit) -> SurfelFit:
-        """Some more batches, at falling rates.
-
-        Args:
-            fit: that goes on, in place.
-
-        Returns:
-            the same fit.
-        """
-        solve_spots(fit)
-        fit.run(1, steps=WARM, settle=False)
-        return solve_spots(fit)
+        return go_on(fit.copy(Extension(fewer), self.seed))
 
     def _trials(self, jobs: list[Job]) -> list[Trial]:
         named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]

@@ -17,7 +17,7 @@ from torch import Tensor
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import Formula, formulas_of
 from nlos_lit.effects.free_terms import Free
-from nlos_lit.inference.criticise import Findings, Loop, copy_effects
+from nlos_lit.inference.criticise import Findings, Loop, copy_effects, go_on
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
 from nlos_lit.surfels.fit import SurfelFit
 
@@ -81,7 +81,7 @@ def _of_term(loop: Loop, final: SurfelFit, name: str) -> Follower | None:
     def with_it(formula: Formula) -> SurfelFit:
         fit = bare.copy(copy_effects(bare.extension, [formula]), loop.seed)
         fit.match_energy()  # a constant is none of a formula's, and may have been of the term's
-        return loop.go_on(fit)
+        return go_on(fit)
 
     jobs = [
         ("going on with all", "all", partial(loop.warm, final, [])),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from nlos_lit.inference.criticise import Turn
 from nlos_lit.inference.result import Accepted, Diagnosis
@@ -78,27 +79,30 @@ def confidence(diagnosis: Diagnosis) -> str:
     return text
 
 
-def next_step(diagnosis: Diagnosis, scene: Sequence[str] = ()) -> Advice:
+def next_step(diagnosis: Diagnosis, scene: Sequence[str] = (), folder: Path | None = None) -> Advice:
     """The one thing to do first.
 
     Args:
         diagnosis: the whole.
         scene: settings of the command line that name the scene.
+        folder: of the run that was diagnosed; None where it is not known.
 
     Returns:
         on the rig, or at the keyboard.
     """
-    base = ["python", "train.py", *scene]
+    base = ["nlos", "train", *scene]
     found = sorted(diagnosis.effects, key=_gain, reverse=True)
     if found:
         first = found[0]
         known = shlex.join([*base, f"effects=[{','.join(e.name for e in diagnosis.effects)}]"])
         others = rivals(diagnosis, first)
         if others and first.split_by:
+            asked = "" if folder is None else f"nlos diagnose {shlex.quote(str(folder))} --split-with FILE\n"
             return Advice(
-                f"Tell the candidates apart: take {first.split_by}, and diagnose it. Until then the"
-                " reconstruction can be made with the first of them in the model:",
-                known,
+                f"Tell the candidates apart: take {first.split_by}."
+                + (" Where that is a capture of the scene, the first command asks it." if asked else "")
+                + " Until then the reconstruction can be made with the first of them in the model:",
+                asked + known,
             )
         remedy = describe(first.name).words.remedy
         more = " Then the next one." if len(found) > 1 else ""

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from nlos_lit.effects.formulas import FORMULAS, written
-from nlos_lit.inference.result import Accepted, Diagnosis, Followed
+from nlos_lit.inference.result import Accepted, Diagnosis, Followed, Further
 from nlos_lit.io.files import whole_file, write_json
 from nlos_lit.report.advice import confidence, next_step
 from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
@@ -23,6 +23,7 @@ from nlos_lit.report.glossary import glossary_list, glossed
 from nlos_lit.report.page_style import CSS
 from nlos_lit.report.quantities import NONE, amount, amount_of, headline, number, percent, quantity
 from nlos_lit.report.style import save_figure
+from nlos_lit.report.together import rows, told_apart
 from nlos_lit.report.verdict import (
     at_noise,
     barely,
@@ -107,7 +108,7 @@ def write_report(
     page = folder / "report.html"
     with whole_file(page) as partial:
         explorable = (folder / "explore.html").is_file()
-        text = report_html(diagnosis, images, list(extra), scene, explorable)
+        text = report_html(diagnosis, images, list(extra), scene, explorable, folder.parent)
         partial.write_text(text, encoding="utf-8")
     return page
 
@@ -139,6 +140,7 @@ def report_html(
     extra: Iterable[str] = (),
     scene: Sequence[str] = (),
     explorable: bool = False,
+    folder: Path | None = None,
 ) -> str:
     """The page.
 
@@ -148,6 +150,7 @@ def report_html(
         extra: names of those that go to the end.
         scene: settings of the command line that name the scene.
         explorable: ``explore.html`` is beside it.
+        folder: of the run, for the command that takes another capture; None names none.
 
     Returns:
         HTML that needs nothing but itself.
@@ -162,7 +165,7 @@ def report_html(
     found = missing(diagnosis)
     each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
     known: set[str] = set()
-    advice = next_step(diagnosis, scene)
+    advice = next_step(diagnosis, scene, folder)
     command = f"<pre tabindex=0><code>{_text(advice.command)}</code></pre>" if advice.command else ""
     link = '<p><a href="explore.html">Explore scene, wall and transients</a></p>' if explorable else ""
     parts = [
@@ -181,6 +184,7 @@ def report_html(
         if diagnosis.effects or diagnosis.unknown
         else "",
         _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
+        *(_section(f"What {_text(one.name)} says of it", _further(one)) for one in diagnosis.further),
         _section("Where simulation and measurement differ", _calm(diagnosis) + shown("residual_")),
         _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
         _section("Every known effect and free term, tested", shown("screening") + _screened(diagnosis))
@@ -317,6 +321,16 @@ def _groups(diagnosis: Diagnosis) -> str:
         names = " or ".join(f"{describe(name).phrase} ({name})" for name in group)
         items.append(f"<li>{_text(names + how)}</li>")
     return f"<p>These leave nearly the same trace in this capture.</p><ul>{''.join(items)}</ul>"
+
+
+def _further(further: Further) -> str:
+    heads = ["Was open", "Gain there over none of them (nats)", "Values", "Weight, all captures", "Verdict"]
+    text = (
+        f"{told_apart(further)} Only what was open was asked, each beside a scene of that capture's own, and"
+        " judged by parts of the wall that were not fitted. What belongs to the wall or to how the rig stands"
+        " keeps the values found before, within their errors."
+    )
+    return f"<p>{_text(text)}</p>" + _table(heads, rows(further), "cards")
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:

@@ -21,9 +21,11 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
+from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.places import CONF
+from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.folder import register_names
 from nlos_lit.training.instantiate import arguments_of
@@ -93,7 +95,7 @@ def settings_of(kind: Callable[..., T], values: Mapping[str, Any], where: str, *
         raise UserError(f"{where} is incomplete: {error}") from error
 
 
-def _plain_yaml(file: Path) -> dict[str, Any]:
+def plain_yaml(file: Path) -> dict[str, Any]:
     """A config that a run has written; the file may come from anywhere, and be made to take all memory."""
     foreign = UserError(f"{file} is damaged, or not written by this program")
     if file.stat().st_size > LARGEST_CONFIG:
@@ -114,6 +116,30 @@ def _plain_yaml(file: Path) -> dict[str, Any]:
     return cast(dict[str, Any], config)
 
 
+def pipeline_of(
+    settings: Mapping[str, Any], scene: Mapping[str, Any], model: Mapping[str, Any]
+) -> BasePipeline:
+    """What a diagnosis fits with.
+
+    Args:
+        settings: of ``diagnose``, resolved.
+        scene: of the capture, planned.
+        model: of the image.
+
+    Returns:
+        Image and fit of the base.
+
+    Raises:
+        UserError: a section holds what there is not.
+    """
+    return BasePipeline(
+        volume=scene["volume"],
+        model=settings_of(PipelineSettings, model, "model"),
+        surfels=settings_of(SurfelSettings, settings["surfels"], "surfels"),
+        budget=parse_bytes(settings["memory_budget"]),
+    )
+
+
 def run_config(folder: str | Path) -> dict[str, Any]:
     """The resolved config that a run left in its folder.
 
@@ -129,7 +155,7 @@ def run_config(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / "config.yaml"
     if not file.is_file():
         raise UserError(f"{folder} is not the folder of a finished run: {file.name} is missing")
-    config = _plain_yaml(file)
+    config = plain_yaml(file)
     missing = {"scene", "model", "objective", "optimizer", "surfels", "export"} - set(config)
     unread = {
         f"{name}.{key}"
