@@ -16,6 +16,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
+from nlos_lit.inference.advise import expected_nats
 from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.distil import Follower
 from nlos_lit.inference.heldout import Comparison, score
@@ -144,12 +145,23 @@ def _accepted(
         heldout_gain=_gain(found.final, found.losses[trial.name], split),
         weights={name: weight / total for name, weight in weights.items()},
         split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
+        advised=_advised(effect.name, list(weights), turn.trials),
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
         formula=followed.get(effect.name),
         needed=confirmed.needed,
         tried={name: _tried(name, turn.trials, split) for name in weights},
     )
+
+
+def _advised(name: str, names: list[str], trials: list[Trial]) -> dict[str, float]:
+    """What captures would tell of a term and the hardest of its rivals; those of single spots aside."""
+    tried = {t.name: t.fit for t in trials if t.candidate is not None and not t.candidate.effect.per_spot}
+    rivals = [rival for rival in names if rival != name and rival in tried]
+    if name not in tried or not rivals:
+        return {}
+    told = [expected_nats(tried[name], tried[rival], (name, rival)) for rival in rivals]
+    return {plan: min(each[plan] for each in told) for plan in told[0]}
 
 
 def _tried(name: str, trials: list[Trial], split: Split) -> Tried:

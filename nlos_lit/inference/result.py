@@ -107,6 +107,8 @@ class Accepted:
         shape: of a free term. formula: that it follows best; None where none was asked for.
         needed: nats of evidence that this term needed; None for those of all others.
         tried: the names of ``weights`` as they were tried, each beside the same scene.
+        advised: nats that captures as long as this one are expected to tell between the term and the rival
+            that is hardest to tell from it, by what is done in them, see :mod:`nlos_lit.inference.advise`.
     """
 
     name: str
@@ -120,6 +122,7 @@ class Accepted:
     formula: Followed | None = None
     needed: float | None = None
     tried: dict[str, Tried] = field(default_factory=dict)
+    advised: dict[str, float] = field(default_factory=dict)
 
     @property
     def confusable_with(self) -> list[str]:

@@ -17,7 +17,7 @@ from torch.utils.tensorboard import SummaryWriter
 from nlos_lit.effects.formulas import FORMULAS, written
 from nlos_lit.inference.result import Accepted, Diagnosis, Followed, Further
 from nlos_lit.io.files import whole_file, write_json
-from nlos_lit.report.advice import confidence, next_step
+from nlos_lit.report.advice import advised, confidence, next_step
 from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
 from nlos_lit.report.glossary import glossary_list, glossed
 from nlos_lit.report.page_style import CSS
@@ -319,7 +319,8 @@ def _groups(diagnosis: Diagnosis) -> str:
         splits = [t.split_by for t in terms if t.split_by]
         how = f" – split by: {'; '.join(dict.fromkeys(splits))}" if splits else ""
         names = " or ".join(f"{describe(name).phrase} ({name})" for name in group)
-        items.append(f"<li>{_text(names + how)}</li>")
+        worked_out = "".join(advised(t) for t in terms)
+        items.append(f"<li>{_text(names + how)}{_text(f'.{worked_out}' if worked_out else '')}</li>")
     return f"<p>These leave nearly the same trace in this capture.</p><ul>{''.join(items)}</ul>"
 
 

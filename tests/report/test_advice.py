@@ -9,6 +9,7 @@ import pytest
 from matplotlib.colors import to_hex
 from report_cases import CASES, TAIL, TAIL_ALONE, TILT, UNKNOWN, diagnosis, free, profiles, two_found
 
+from nlos_lit.inference.advise import AGAIN
 from nlos_lit.inference.result import Diagnosis, Estimate, Followed, Gain, Scores
 from nlos_lit.report import diagnosis_figures as plots
 from nlos_lit.report.advice import TELLS, confidence, next_step
@@ -121,3 +122,21 @@ def test_a_formula_that_keeps_too_little_is_told_and_not_offered(tmp_path):
     assert "which keeps 42 % of its gain" in text
     assert not (tmp_path / "effects").exists()
     assert "follows" not in next_step(following(0.42, False)).text
+
+
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        (39.0, "By calculation the same scan again would tell as much as others: 20 nats."),
+        (140.0, "By calculation a second scan in another order would tell 140 nats, the same scan again 20."),
+    ],
+)
+def test_what_another_capture_would_tell_is_said_where_names_are_open(order, said):
+    """From twice as much on."""
+    told = {AGAIN: 20.0, "a second scan in another order": order, "a capture with the laser off": 1.0}
+    open_ = two_found(
+        effects=[dataclasses.replace(TAIL, advised=told)], groups=[["irf_tail", "afterpulsing"]]
+    )
+    assert said in next_step(open_).text
+    assert said in report_html(open_, {})
+    assert "By calculation" not in next_step(two_found(effects=[TAIL], groups=[])).text

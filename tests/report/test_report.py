@@ -130,6 +130,7 @@ def test_json_is_the_diagnosis(written, case):
             "heldout_gain",
             "weights",
             "split_by",
+            "advised",
             "axis",
             "shape",
             "formula",
