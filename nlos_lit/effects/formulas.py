@@ -158,7 +158,8 @@ class Formula(Form, Effect):
     Attributes:
         free: the free term whose place it is.
         where: the axis in words. acts: the equation of the place, in terms of f.
-        size: unit, noticeable change and bound of the amplitudes, bins for a delay.
+        size: unit, noticeable change and bound of the amplitudes, bins for a delay. one_way: they cannot be
+            negative.
     """
 
     free: ClassVar[type[Free]]
@@ -166,22 +167,18 @@ class Formula(Form, Effect):
     acts: ClassVar[str]
     size: ClassVar[tuple[str, float, float]] = ("1", 0.05, 3.0)
     kind: ClassVar[str] = "plain"
+    one_way: ClassVar[bool] = False
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         unit, scale, bound = cls.size
         unit_size = scan.bin_length if unit == "m" else 1.0
-        low = 0.0 if cls.one_way() else -bound * unit_size
+        low = 0.0 if cls.one_way else -bound * unit_size
         amplitudes = [
             Parameter(name, unit, 0.0, scale * unit_size, low, bound * unit_size, kind=cls.kind)
             for name in cls.names
         ]
         return (*amplitudes, *cls.shape())
-
-    @classmethod
-    def one_way(cls) -> bool:
-        """Amplitudes cannot be negative."""
-        return False
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -264,10 +261,7 @@ class WidthOverScan(_OverScan):
     free, where = FreeResponseScan, "in the response's width over the course of the scan"
     acts = "signal → signal * N(0, f bins²)"
     size: ClassVar[tuple[str, float, float]] = ("1", 1.0, 100.0)
-
-    @classmethod
-    def one_way(cls) -> bool:
-        return True
+    one_way: ClassVar[bool] = True
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Its first kernel spreads light by a bin to either side: a variance of twice its coefficient.
@@ -345,7 +339,7 @@ def _words(form: type[Form], place: type[Formula]) -> EffectWords:
 
 
 FORMULAS: tuple[type[Formula], ...] = tuple(
-    _pair(form, place) for place in PLACES for form in FORMS if form.form in ONE_SIGN or not place.one_way()
+    _pair(form, place) for place in PLACES for form in FORMS if form.form in ONE_SIGN or not place.one_way
 )
 
 
