@@ -38,6 +38,7 @@ class Effect(nn.Module, Hooks):
             over its neighbours counts.
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
             it with the same values.
+        with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
         needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
@@ -51,6 +52,7 @@ class Effect(nn.Module, Hooks):
     per_spot: ClassVar[bool] = False
     in_runs: ClassVar[bool] = False
     lasting: ClassVar[bool] = False
+    with_power: ClassVar[tuple[str, ...]] = ()
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False

@@ -62,6 +62,23 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Followed:
+    """The formula that comes nearest to a free term, see :mod:`nlos_lit.inference.distil`.
+
+    Args:
+        name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
+        share: of the free term's gain on spots that were not fitted.
+        offered: it keeps enough to be an effect of its own.
+    """
+
+    name: str
+    equation: str
+    parameters: dict[str, Estimate]
+    share: float
+    offered: bool
+
+
+@dataclass(frozen=True)
 class Tried:
     """A term as it was tried beside a scene.
 
@@ -85,9 +102,11 @@ class Accepted:
             what weighs too little is left out.
         split_by: the measurement that would tell those apart.
         axis: of a free term, else empty.
-        shape: of a free term.
+        shape: of a free term. formula: that it follows best; None where none was asked for.
         needed: nats of evidence that this term needed; None for those of all others.
         tried: the names of ``weights`` as they were tried, each beside the same scene.
+        advised: nats that captures as long as this one are expected to tell between the term and the rival
+            that is hardest to tell from it, by what is done in them, see :mod:`nlos_lit.inference.advise`.
     """
 
     name: str
@@ -98,8 +117,10 @@ class Accepted:
     split_by: str = ""
     axis: str = ""
     shape: Shape | None = None
+    formula: Followed | None = None
     needed: float | None = None
     tried: dict[str, Tried] = field(default_factory=dict)
+    advised: dict[str, float] = field(default_factory=dict)
 
     @property
     def confusable_with(self) -> list[str]:
