@@ -172,6 +172,7 @@ class _Asking:
             weights={n: left[n] / sum(left.values()) for n in order},
             split_by="; ".join(sorted({EFFECTS.splitting(first, n) for n in left} - {""})),
             tried={n: tried[n] for n in order},
+            advised=term.advised if len(order) > 1 else {},
         )
         if first != term.name:
             stays = replace(stays, name=first, parameters=self._parameters(fits[first], first))
