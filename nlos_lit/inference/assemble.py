@@ -167,32 +167,26 @@ def _advised(name: str, names: list[str], trials: list[Trial]) -> dict[str, floa
 def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
     trial = next(t for t in trials if t.name == name)
     none = next(t for t in trials if t.candidate is None)
-    assert trial.candidate is not None
-    return tried_with(trial.candidate, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
+    return tried_with(name, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
 
 
-def tried_with(candidate: Candidate, fit: SurfelFit, nats: list[float]) -> Tried:
+def tried_with(name: str, fit: SurfelFit, nats: list[float]) -> Tried:
     """What is kept of a term that was tried.
 
     Args:
-        candidate: as the pool saw it.
+        name: of the term.
         fit: that went on with it.
         nats: of each wall block.
 
     Returns:
         The record; with values where another capture of the same wall has them alike.
     """
-    effect = next(e for e in fit.extension.effects if e.name == candidate.name)
+    effect = next(e for e in fit.extension.effects if e.name == name)
     if not effect.lasting:
         return Tried(nats)
-    sizes = [p.size for p in effect.amplitudes]
-    errors = [
-        (p.scale * part.float()).tolist()
-        for p, part in zip(effect.amplitudes, candidate.error.split(sizes), strict=True)
-    ]
-    names = [p.name for p in effect.amplitudes]
-    values = {name: effect.value(name).detach().reshape(-1).tolist() for name in names}
-    return Tried(nats, values, dict(zip(names, errors, strict=True)))
+    return Tried(
+        nats, {p.name: effect.value(p.name).detach().reshape(-1).tolist() for p in effect.amplitudes}
+    )
 
 
 def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
@@ -312,6 +306,15 @@ def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
 
 
 def facts_of(capture: Capture, name: str) -> dict[str, Any]:
+    """What a diagnosis says of its capture.
+
+    Args:
+        capture: that was diagnosed.
+        name: of it.
+
+    Returns:
+        JSON-serialisable; ``wall`` is the scanned part, ``[x0, x1, y0, y1]``, m.
+    """
     first, last = capture.gate
     order = capture.scan_order
     points = capture.sensor if np.ptp(capture.sensor, axis=0).max() > 0 else capture.laser

@@ -84,13 +84,11 @@ class Tried:
 
     Args:
         nats: gained over none, one number for each held-out wall block of each capture.
-        values: of its amplitudes, by name, in their units, if they are the same in other captures.
-        errors: of these.
+        values: of its amplitudes, by name, in their units, if other captures must have the same.
     """
 
     nats: list[float]
     values: dict[str, list[float]] = field(default_factory=dict)
-    errors: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -187,7 +185,8 @@ class Further:
         name: of that capture.
         asked: names that were open, the accepted one first.
         nats: what each gains there over none of them, on wall blocks that were not fitted.
-        held: names whose values were to stay, within their errors, what they were before.
+        kept: of names whose values must stay what they were, the share of the gain of values fitted anew
+            that those of before keep; below a half these contradict each other, and ``nats`` are theirs.
         seen: that capture asks for any of them by itself.
         weights: of all captures together, by name.
         stays: names that are left, the accepted one first.
@@ -196,7 +195,7 @@ class Further:
     name: str
     asked: list[str]
     nats: dict[str, float]
-    held: list[str]
+    kept: dict[str, float]
     seen: bool
     weights: dict[str, float]
     stays: list[str]

@@ -329,7 +329,8 @@ def _further(further: Further) -> str:
     text = (
         f"{told_apart(further)} Only what was open was asked, each beside a scene of that capture's own, and"
         " judged by parts of the wall that were not fitted. What belongs to the wall or to how the rig stands"
-        " keeps the values found before, within their errors."
+        " must have the values that it had: where these keep less than half of what values fitted anew gain,"
+        " it is judged by them."
     )
     return f"<p>{_text(text)}</p>" + _table(heads, rows(further), "cards")
 

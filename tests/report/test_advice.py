@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,13 +40,16 @@ def test_what_to_do_next_depends_on_what_was_found():
     scene = ["scene=capture", "scene.path=my file.mat"]
     alone = next_step(two_found(effects=[TAIL_ALONE], groups=[]), scene)
     assert alone.text.startswith("Measure the instrument response on the direct pulse")
-    assert alone.command == "python train.py scene=capture 'scene.path=my file.mat' 'effects=[irf_tail]'"
+    assert alone.command == "nlos train scene=capture 'scene.path=my file.mat' 'effects=[irf_tail]'"
     both = next_step(two_found(effects=[TAIL_ALONE, TILT], groups=[]), scene)
     assert "effects=[irf_tail,wall_tilt]" in both.command
     assert both.text.startswith("Measure the wall's plane")  # of the larger gain
     open_ = next_step(two_found(effects=[TAIL], groups=[]), scene)
     assert open_.text.startswith("Tell the candidates apart: take a capture with other background light")
-    assert next_step(CASES["nothing"], ["scene=su"]).command == "python train.py scene=su refine=true"
+    asking = next_step(two_found(effects=[TAIL], groups=[]), scene, Path("outputs/my file/one"))
+    assert asking.command.splitlines()[0] == "nlos diagnose 'outputs/my file/one' --split-with FILE"
+    assert asking.command.splitlines()[1] == open_.command
+    assert next_step(CASES["nothing"], ["scene=su"]).command == "nlos train scene=su refine=true"
     assert "scene.volume.depth" in next_step(diagnosis(base=ABOVE, untouched_test={})).text
 
 
