@@ -206,6 +206,13 @@ class Formula(Form, Effect):
         """
         raise NotImplementedError
 
+    def along(self, edges: Tensor) -> Tensor | None:
+        """``[…]`` x at places of the axis, as :attr:`~nlos_lit.inference.result.Shape.edges` has them.
+
+        None where f is not what the free term's shape shows.
+        """
+        raise NotImplementedError
+
     def quantities(self) -> dict[str, Quantity]:
         return {p.name: Quantity(self.value(p.name), p.unit, kind=p.kind) for p in self.declared.values()}
 
@@ -223,6 +230,9 @@ class _OverScan(Formula):
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.order[spots], free.values()[spots], torch.ones(len(spots))
+
+    def along(self, edges: Tensor) -> Tensor | None:
+        return edges / len(self.order)
 
 
 class CountsOverScan(_OverScan):
@@ -268,6 +278,9 @@ class WidthOverScan(_OverScan):
         assert isinstance(free, FreeResponseScan)
         return self.order[spots], 2 * free.weights()[:, 0][spots], torch.ones(len(spots))
 
+    def along(self, edges: Tensor) -> None:
+        return None
+
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         length = 2 * signal.shape[1]
         wave = 2 * math.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
@@ -281,9 +294,12 @@ class CountsOverTime(Formula):
     free, where, acts = FreeTime, "along the time axis", "m_t → m_t e^f, x from the gate's start to its end"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        first, last = self.scan.gate
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
-        return expected * torch.exp(self.f(((bins - first) / (last - 1 - first)).clamp_min(0.0)))
+        return expected * torch.exp(self.f(self.along(bins)))
+
+    def along(self, edges: Tensor) -> Tensor:
+        first, last = self.scan.gate
+        return ((edges - first) / (last - 1 - first)).clamp_min(0.0)
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         first, last = self.scan.gate
@@ -297,8 +313,10 @@ class CountsOverRate(Formula):
     acts = "m → m e^f, x the spot's counts over e² times the scan's mean"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        most = self.scan.mean_counts * math.exp(RATES[1])
-        return expected * torch.exp(self.f(expected.sum(1, keepdim=True) / most))
+        return expected * torch.exp(self.f(self.along(expected.sum(1, keepdim=True))))
+
+    def along(self, edges: Tensor) -> Tensor:
+        return edges / (self.scan.mean_counts * math.exp(RATES[1]))
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Knots are evenly spaced along ln n; each has the spots about it.

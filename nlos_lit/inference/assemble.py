@@ -80,7 +80,8 @@ def assemble(
         return Uncertainty(fit, torch.from_numpy(spots), fit.counts[rows], block, share)
 
     uncertainty = uncertainty_of(final)
-    followed = {name: _followed(f, uncertainty_of(f.fit)) for name, f in followers.items()}
+    terms = {e.name: e for e in final.extension.effects if isinstance(e, Free)}
+    followed = {n: _followed(f, terms[n], uncertainty_of(f.fit), scan) for n, f in followers.items()}
     accepted = [_accepted(turn, found, uncertainty, split, scan, followed) for turn in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
@@ -113,11 +114,34 @@ def assemble(
     )
 
 
-def _followed(follower: Follower, uncertainty: Uncertainty) -> Followed:
+def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Scan) -> Followed:
     formula = next(e for e in follower.fit.extension.effects if e.name == follower.name)
     assert isinstance(formula, Formula)
-    parameters = uncertainty.parameters(formula, None)
-    return Followed(follower.name, formula.equation, parameters, follower.share, follower.offered)
+    parameters, shape = uncertainty.parameters(formula, None), shape_of(free, scan)
+    curve = laid_through(formula, free, follower.fit, torch.from_numpy(shape.edges).float())
+    told = (follower.name, formula.equation, parameters, follower.share, follower.offered)
+    return Followed(*told, curve)
+
+
+@torch.no_grad()
+def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray | None:
+    """A formula at places of an axis, as high as the free term that it follows.
+
+    Args:
+        formula: of ``fit``.
+        free: the term.
+        fit: with the formula.
+        edges: ``[K]`` of the axis.
+
+    Returns:
+        ``[K]``; None where the term shows something else.
+    """
+    x = formula.along(edges)
+    if x is None:
+        return None
+    at, values, weight = formula.seen_in(free, fit.train, fit.model.expected(fit.train, fit.extension))
+    constant = (weight * (values - formula.f(at))).sum() / weight.sum()
+    return (formula.f(x) + constant).numpy()
 
 
 def _accepted(

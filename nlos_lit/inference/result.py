@@ -69,6 +69,8 @@ class Followed:
         name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
         share: of the free term's gain on spots that were not fitted.
         offered: it keeps enough to be an effect of its own.
+        curve: ``[K + 1]`` its values at the edges of the free term's shape, a constant added that lays it
+            through that; None where the two are not of one kind.
     """
 
     name: str
@@ -76,6 +78,7 @@ class Followed:
     parameters: dict[str, Estimate]
     share: float
     offered: bool
+    curve: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

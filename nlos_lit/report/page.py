@@ -346,8 +346,18 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         "A free term is a correction without a name, of any form along its axis."
         f" The most evidence is {held}."
     )
-    told = "".join(f"<p>{_text(follows(term))}</p>" for term in diagnosis.unknown)
+    told = "".join(f"<p>{_text(follows(term) + _offer(term))}</p>" for term in diagnosis.unknown)
     return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown) + told
+
+
+def _offer(term: Accepted) -> str:
+    """Where the formula lies that a free term follows."""
+    if term.formula is None or not term.formula.offered:
+        return ""
+    return (
+        f" The file effects/{term.formula.name}.py beside this page holds it as an effect; copied to"
+        " nlos_lit/effects and named in its __init__.py it is one of the registry."
+    )
 
 
 def _scores(diagnosis: Diagnosis) -> str:

@@ -104,7 +104,8 @@ def test_nothing_is_red_where_nothing_was_found():
 def following(share: float, offered: bool) -> Diagnosis:
     """A free term along the scan that comes so near to a step."""
     numbers = {"height": Estimate(-0.117, 0.004, "1"), "place": Estimate(0.412, 0.003, "1")}
-    formula = Followed("counts_over_scan_step", "height σ((x - place)/0.01)", numbers, share, offered)
+    curve = np.where(np.arange(65) < 26, 0.0, -0.117)
+    formula = Followed("counts_over_scan_step", "height σ((x - place)/0.01)", numbers, share, offered, curve)
     term = dataclasses.replace(UNKNOWN["free_scan"], formula=formula)
     return dataclasses.replace(CASES["unexplained"], unknown=[term])
 
@@ -144,3 +145,10 @@ def test_what_another_capture_would_tell_is_said_where_names_are_open(order, sai
     assert said in next_step(open_).text
     assert said in report_html(open_, {})
     assert "By calculation" not in next_step(two_found(effects=[TAIL], groups=[])).text
+
+
+def test_the_formula_is_drawn_over_the_free_term():
+    figure = plots.diagnosis_figures(following(0.97, True))["unknown_free_scan"]
+    (line,) = [one for one in figure.axes[0].lines if len(one.get_ydata()) == 65]
+    assert line.get_ydata()[[0, -1]].tolist() == pytest.approx([0.0, 100 * np.expm1(-0.117)])
+    assert figure.axes[0].get_legend().get_texts()[0].get_text() == "a step over the course of the scan"
