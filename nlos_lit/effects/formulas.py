@@ -61,7 +61,15 @@ class Form:
 
     @staticmethod
     def functions(x: Tensor, shape: Tensor) -> Tensor:
-        """``[…, J]`` values of b_j at ``x`` ``[…]``; ``shape`` is a scalar."""
+        """Values of b_j.
+
+        Args:
+            x: ``[…]``.
+            shape: a scalar, of the scanned parameter.
+
+        Returns:
+            ``[…, J]``.
+        """
         raise NotImplementedError
 
 
@@ -209,9 +217,13 @@ class Formula(Form, Effect):
         raise NotImplementedError
 
     def along(self, edges: Tensor) -> Tensor | None:
-        """``[…]`` x at places of the axis, as :attr:`~nlos_lit.inference.result.Shape.edges` has them.
+        """Where places of the axis are.
 
-        None where f is not what the free term's shape shows.
+        Args:
+            edges: ``[…]`` as :class:`~nlos_lit.inference.result.Shape` has them.
+
+        Returns:
+            ``[…]`` x; None where f is not what the free term's shape shows.
         """
         raise NotImplementedError
 
