@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from typing import ClassVar
 
 import torch
@@ -60,7 +61,15 @@ class Form:
 
     @staticmethod
     def functions(x: Tensor, shape: Tensor) -> Tensor:
-        """``[…, J]`` values of b_j at ``x`` ``[…]``; ``shape`` is a scalar."""
+        """Values of b_j.
+
+        Args:
+            x: ``[…]``.
+            shape: a scalar, of the scanned parameter.
+
+        Returns:
+            ``[…, J]``.
+        """
         raise NotImplementedError
 
 
@@ -157,7 +166,7 @@ class Formula(Form, Effect):
 
     Attributes:
         free: the free term whose place it is.
-        where: the axis in words. acts: the equation of the place, in terms of f.
+        where: the axis in words. acts: the equation of the place, in terms of f. is_x: what x is.
         size: unit, noticeable change and bound of the amplitudes, bins for a delay. one_way: they cannot be
             negative.
     """
@@ -165,6 +174,7 @@ class Formula(Form, Effect):
     free: ClassVar[type[Free]]
     where: ClassVar[str]
     acts: ClassVar[str]
+    is_x: ClassVar[str]
     size: ClassVar[tuple[str, float, float]] = ("1", 0.05, 3.0)
     kind: ClassVar[str] = "plain"
     one_way: ClassVar[bool] = False
@@ -207,9 +217,13 @@ class Formula(Form, Effect):
         raise NotImplementedError
 
     def along(self, edges: Tensor) -> Tensor | None:
-        """``[…]`` x at places of the axis, as :attr:`~nlos_lit.inference.result.Shape.edges` has them.
+        """Where places of the axis are.
 
-        None where f is not what the free term's shape shows.
+        Args:
+            edges: ``[…]`` as :class:`~nlos_lit.inference.result.Shape` has them.
+
+        Returns:
+            ``[…]`` x; None where f is not what the free term's shape shows.
         """
         raise NotImplementedError
 
@@ -218,6 +232,7 @@ class Formula(Form, Effect):
 
 
 class _OverScan(Formula):
+    is_x: ClassVar[str] = "the order of acquisition from 0 to 1"
     order: Tensor
 
     def __init__(self, scan: Scan) -> None:
@@ -291,7 +306,8 @@ class WidthOverScan(_OverScan):
 class CountsOverTime(Formula):
     """All spots count too much or too little in the same bins."""
 
-    free, where, acts = FreeTime, "along the time axis", "m_t → m_t e^f, x from the gate's start to its end"
+    free, where, acts = FreeTime, "along the time axis", "m_t → m_t e^f"
+    is_x = "the time from 0 in the gate's first bin to 1 in its last"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
@@ -309,8 +325,8 @@ class CountsOverTime(Formula):
 class CountsOverRate(Formula):
     """Spots with many counts have too few, or too many."""
 
-    free, where = FreeRate, "with the count rate"
-    acts = "m → m e^f, x the spot's counts over e² times the scan's mean"
+    free, where, acts = FreeRate, "with the count rate", "m → m e^f"
+    is_x = "a spot's counts over e² times the scan's mean"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         return expected * torch.exp(self.f(self.along(expected.sum(1, keepdim=True))))
@@ -389,16 +405,26 @@ def written(formula: type[Formula], found: str) -> str:
     Returns:
         Python source; its module's name is the formula's.
     """
-    found = re.sub(r"[^\w .,;:%±·()-]", "", found)
     form, place = formula.__mro__[1:3]
     assert issubclass(form, Form)
     assert issubclass(place, Formula)
     words, title = formula.words, "".join(part.capitalize() for part in formula.name.split("_"))
     assert words is not None
-    unit = place.size[0]
     amplitudes = ", ".join(f"``{name}``" for name in form.names)
-    told = f" {form.told}" if form.told else ""
     phrase = words.phrase[0].upper() + words.phrase[1:]
+    clean = re.sub(r"[^-\u2212±·%().,:;\w ]", "", found)
+    paragraphs = [
+        f"{phrase}.",
+        f"``{place.acts}``, ``f = {form.equation}``, x {place.is_x}.",
+        f"Parameters: {amplitudes} ({place.size[0]}), null 0. {form.told}",
+        f"Signature: the residual follows this form {place.where}.",
+        "Degenerate with: any effect that changes the same along the same axis.",
+        f"Source: {clean}",
+    ]
+    lines = [
+        textwrap.fill(p.strip(), 106, initial_indent=4 * " ", subsequent_indent=4 * " ") for p in paragraphs
+    ]
+    docstring = "\n\n".join(lines).lstrip()
     return f'''"""{phrase}."""
 
 from __future__ import annotations
@@ -408,17 +434,7 @@ from nlos_lit.effects.words import EffectWords
 
 
 class {title}({form.__name__}, {place.__name__}):
-    """{phrase}.
-
-    ``{place.acts}``, ``f = {form.equation}``, x along the axis from 0 to 1.
-
-    Parameters: {amplitudes} ({unit}), null 0.{told}
-
-    Signature: the residual follows this form {place.where}.
-
-    Degenerate with: any effect that changes the same along the same axis.
-
-    Source: {found}
+    """{docstring}
     """
 
     name = "{formula.name}"

@@ -119,7 +119,8 @@ def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Sc
     assert isinstance(formula, Formula)
     parameters, shape = uncertainty.parameters(formula, None), shape_of(free, scan)
     curve = laid_through(formula, free, follower.fit, torch.from_numpy(shape.edges).float())
-    told = (follower.name, formula.equation, parameters, follower.share, follower.offered)
+    equation = f"{formula.equation}, x {formula.is_x}"
+    told = (follower.name, equation, parameters, follower.share, follower.offered)
     return Followed(*told, curve)
 
 

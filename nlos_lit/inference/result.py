@@ -66,7 +66,7 @@ class Followed:
     """The formula that comes nearest to a free term, see :mod:`nlos_lit.inference.distil`.
 
     Args:
-        name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
+        name: of the formula. equation: in terms of x, and what x is.
         share: of the free term's gain on spots that were not fitted.
         offered: it keeps enough to be an effect of its own.
         curve: ``[K + 1]`` its values at the edges of the free term's shape, a constant added that lays it

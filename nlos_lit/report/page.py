@@ -116,7 +116,7 @@ def write_report(
 def _write_effect(formula: Followed, diagnosis: Diagnosis, folder: Path) -> None:
     """The file of a formula that a free term follows, as an effect of its own."""
     share, size = percent(formula.share), headline(formula.name, formula.parameters)
-    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of a free term's gain."
+    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of the gain of a free term."
     kind = next(each for each in FORMULAS if each.name == formula.name)
     with whole_file(folder / f"{formula.name}.py") as partial:
         partial.write_text(written(kind, found), encoding="utf-8")

@@ -214,7 +214,7 @@ def follows(term: Accepted) -> str:
     if formula is None:
         return ""
     size, kept = headline(formula.name, formula.parameters), percent(max(formula.share, 0.0))
-    told = f"{describe(formula.name).phrase}, {formula.equation} ({size})"
+    told = f"{describe(formula.name).phrase} (f = {formula.equation}; {size})"
     if not formula.offered:
         return f"No formula that was tried follows it; the nearest is {told}, which keeps {kept} of its gain."
     return f"It follows {told}: this keeps {kept} of its gain on spots that were not fitted."
