@@ -6,8 +6,9 @@ import threading
 import h5py
 import numpy as np
 import pytest
+import scipy.io
 
-from data_modules.readers import detect_format, read_capture
+from data_modules.readers import detect_format, mat5, read_capture
 from data_modules.readers.contents import open_contents
 from data_modules.readers.radiance import read_radiance
 from nlos_lit.capture.errors import CaptureError, UserError
@@ -94,6 +95,37 @@ def test_a_file_of_links_is_refused(tmp_path, groups, links):
                 place[f"l{link}"] = file["H"]
     with pytest.raises(CaptureError, match=r"holds .*[45]\d{3} arrays"):
         open_contents(tmp_path / "a.hdf5")
+
+
+def test_a_number_in_a_chunk_that_fills_the_memory_is_refused(tmp_path):
+    """Packed twice such a chunk is a file of some kB; HDF5 unpacks it as a whole for one number."""
+    path = tmp_path / "a.hdf5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset(
+            "t_start", (1,), "f8", maxshape=(None,), chunks=(500_000_000,), compression="gzip"
+        )
+    assert path.stat().st_size < 10_000
+    with pytest.raises(CaptureError, match=r"t_start in a\.hdf5 has 8e-06 MB in a chunk of 4000 MB"):
+        open_contents(path)
+
+
+def test_a_matlab_file_that_takes_long_to_list_is_refused(tmp_path, monkeypatch):
+    many = tmp_path / "many.mat"
+    scipy.io.savemat(many, {"a": 1.0})
+    head, one = many.read_bytes()[:128], many.read_bytes()[128:]
+    many.write_bytes(head + 5000 * one)
+    with pytest.raises(CaptureError, match=r"many\.mat holds more than 4096 arrays"):
+        open_contents(many)
+    fields = {f"f{number}": 1.0 for number in range(5000)}
+    scipy.io.savemat(tmp_path / "fields.mat", {"held": fields})
+    with pytest.raises(CaptureError, match=r"fields\.mat holds more than 4096 arrays"):
+        open_contents(tmp_path / "fields.mat")
+    packed = tmp_path / "packed.mat"
+    scipy.io.savemat(packed, {n: {"a": np.zeros(9000)} for n in ("one", "two")}, do_compression=True)
+    assert open_contents(packed).has("one.a", "two.a")
+    monkeypatch.setattr(mat5, "_STRUCTS", 100_000)
+    with pytest.raises(CaptureError, match=r"packed\.mat holds packed structs of more than 0\.0 GB"):
+        open_contents(packed)
 
 
 def test_what_a_file_says_does_not_reach_the_terminal_as_it_is(tmp_path):
