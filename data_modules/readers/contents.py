@@ -121,6 +121,9 @@ class Contents:
             raise CaptureError(
                 f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})"
             )
+        if values.dtype.itemsize > 8:  # longer floats than any file of the field has
+            with np.errstate(all="ignore"):
+                return values.astype(np.float64)
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
 
     def counts(self, name: str) -> np.ndarray:
@@ -294,7 +297,16 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
                     shape, dtype = dataset.shape or (), dataset.dtype
                     numeric = dataset.shape is not None and dtype.kind in "uifb"
                     size = math.prod(shape) * dtype.itemsize
-                    chunk = math.prod(dataset.chunks or ()) * dtype.itemsize
+                    chunks, limits = dataset.chunks or (), dataset.maxshape or ()
+                    if any(
+                        limit is not None and limit < chunk
+                        for limit, chunk in zip(limits, chunks, strict=False)
+                    ):
+                        raise CaptureError(
+                            f"{label} in {path.name} has chunks {chunks} where its shape is {limits} at "
+                            "most; the file is damaged"
+                        )
+                    chunk = math.prod(chunks) * dtype.itemsize
                     if chunk > max(size, _CHUNK):
                         raise CaptureError(
                             f"{label} in {path.name} has {size / 1e6:.3g} MB in a chunk of {chunk / 1e6:.0f} "

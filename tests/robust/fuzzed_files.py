@@ -201,13 +201,13 @@ def outcome_of_file(fmt: str, name: str, blob: bytes, folder: Path, look: bool =
     try:
         with no_hang():
             capture = read_capture(path, fmt, options=ReaderOptions(**given))  # type: ignore[arg-type]
+        with no_hang():
+            nonsense(capture)
+            if look:
+                describe(capture, fmt, examine(capture))
     except CaptureError as error:
         sentence = str(error)
         assert sentence, "nothing said"
         assert sentence.isprintable(), repr(sentence)
         return "refused"
-    with no_hang():
-        nonsense(capture)
-        if look:
-            describe(capture, fmt, examine(capture))
     return "read"
