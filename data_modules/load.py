@@ -26,7 +26,11 @@ log = logging.getLogger(__name__)
 
 
 def load_scene(
-    scene: Mapping[str, Any], data_dir: str | Path, seed: int, force: bool = False
+    scene: Mapping[str, Any],
+    data_dir: str | Path,
+    seed: int,
+    force: bool = False,
+    raw: Capture | None = None,
 ) -> tuple[Capture, SurfaceTruth | None]:
     """The scene's capture, ready to fit, and the true surface where it is known.
 
@@ -37,6 +41,7 @@ def load_scene(
         data_dir: folder in which downloaded files are looked for.
         seed: of the photon statistics of a simulated scene.
         force: what cannot be a capture of a hidden scene is told in the log, too, and not refused.
+        raw: the scene's file, where it has been read already (:func:`read_scene`).
 
     Returns:
         Counts summed and gated as the scene says; the surface as seen from the wall, or None.
@@ -50,9 +55,9 @@ def load_scene(
     if simulated:
         capture, truth = _simulate(scene["simulate"], seed)
     else:
-        scene = planned_scene(scene, data_dir, force)[0]
-        path = find_file(scene, Path(data_dir))
-        capture, truth = read_capture(path, scene["format"], options=reader_options(scene["reader"])), None
+        raw = read_scene(scene, data_dir) if raw is None else raw
+        scene = planned_scene(scene, data_dir, force, raw)[0]
+        capture, truth = raw, None
         looks_wrong += whole_numbers(capture)  # sums hide it
     if scene["truth"] is not None:
         truth = _truth(load_truth(Path(scene["truth"])))
@@ -69,8 +74,25 @@ def load_scene(
     return capture, truth
 
 
+def read_scene(scene: Mapping[str, Any], data_dir: str | Path) -> Capture:
+    """The scene's file as it is: not summed, and gated as its reader does.
+
+    Args:
+        scene: a config of conf/scene.
+        data_dir: folder in which downloaded files are looked for.
+
+    Returns:
+        The capture.
+
+    Raises:
+        UserError: it is not there, or not usable.
+    """
+    path = find_file(scene, Path(data_dir))
+    return read_capture(path, scene["format"], options=reader_options(scene["reader"]))
+
+
 def planned_scene(
-    scene: Mapping[str, Any], data_dir: str | Path, force: bool = False
+    scene: Mapping[str, Any], data_dir: str | Path, force: bool = False, raw: Capture | None = None
 ) -> tuple[dict[str, Any], Capture | None]:
     """A scene with what it leaves to its data filled in: bins to sum, gate, depths.
 
@@ -78,6 +100,7 @@ def planned_scene(
         scene: a config of conf/scene; ``sum_bins`` or ``volume.depth`` may be null.
         data_dir: folder in which downloaded files are looked for.
         force: what cannot be a capture of a hidden scene is planned for, too.
+        raw: as of :func:`load_scene`.
 
     Returns:
         The scene, and the capture as it will be fitted, where it had to be read.
@@ -89,8 +112,7 @@ def planned_scene(
     if scene["sum_bins"] is not None and depth is not None:
         return dict(scene), None
     path = find_file(scene, Path(data_dir))
-    capture = read_capture(path, scene["format"], options=reader_options(scene["reader"]))
-    capture = capture.sum_spots(scene["sum_spots"])
+    capture = (read_scene(scene, data_dir) if raw is None else raw).sum_spots(scene["sum_spots"])
     _refuse(nonsense(capture), force)
     plan = plan_capture(capture, scene["wavelength"], scene["sum_bins"], scene["gate"])
     capture = capture.sum_bins(plan.sum_bins).with_gate(*plan.gate)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ SPOTS_LOOKED_AT = 1024  # of large scans every n-th
 SAMPLES = 8  # bins a wavelength; the shortest that a fit may reach, 0.53 of it, has four (conf/model)
 CHANCE = 1e-6  # that noise in a spot's gate is taken for light that comes back
 FAINT = 4  # standard deviations above the floor of light that is counted
+_KNOWN: dict[int, Returns] = {}  # of captures that are still there, by their identity
 LIGHT = 0.99  # share of a spot's light behind which nothing is imaged
 
 
@@ -134,12 +136,16 @@ def returns(capture: Capture) -> Returns:
 
     The rise is the one that leads to the peak, so a direct pulse's tail at the gate's start does not count.
     Spots whose peak may be noise (:func:`light_of`) are left out, and so is light that does not stand
-    ``FAINT`` standard deviations above the floor.
+    ``FAINT`` standard deviations above the floor. They are worked out once for each capture.
     """
-    found = np.array(list(_returns(capture)), dtype=np.float64).reshape(-1, 3)
-    start = capture.path_gate[0]
-    first, last = (start + (found[:, column] + 0.5) * capture.bin_length for column in (0, 1))
-    return Returns(first, last, found[:, 2])
+    key = id(capture)
+    if key not in _KNOWN:
+        found = np.array(list(_returns(capture)), dtype=np.float64).reshape(-1, 3)
+        start = capture.path_gate[0]
+        first, last = (start + (found[:, column] + 0.5) * capture.bin_length for column in (0, 1))
+        _KNOWN[key] = Returns(first, last, found[:, 2])
+        weakref.finalize(capture, _KNOWN.pop, key, None)
+    return _KNOWN[key]
 
 
 def _returns(capture: Capture) -> Iterator[tuple[int, int, float]]:

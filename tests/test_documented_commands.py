@@ -14,6 +14,7 @@ from nlos_lit.commands.nlos import COMMANDS
 from nlos_lit.places import CONF
 from nlos_lit.runtime import schema
 from nlos_lit.runtime.arguments import check_assignments, check_overrides, help_of
+from nlos_lit.runtime.command_line import words_as_settings
 from nlos_lit.runtime.keys import KEYS
 
 PAGES = sorted([*ROOT.glob("docs/*.md"), ROOT / "README.md", ROOT / "CONTRIBUTING.md"])
@@ -57,6 +58,7 @@ def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
     monkeypatch.setattr(schema.os.path, "exists", lambda path: True)
     for program, *words in reaching(printed(sources()[name]), tmp_path):
         command = {"inspect_capture": "inspect"}.get(program.removesuffix(".py"), program.removesuffix(".py"))
+        words = words_as_settings(command, words)
         given = [word.replace("…", "X") for word in words if not word.startswith("-")]
         if (CONF / f"{command}.yaml").exists():
             check_overrides(command, given)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import h5py
 import numpy as np
@@ -21,6 +22,18 @@ from data_modules.readers.mat5 import list_mat5, read_mat5
 from nlos_lit.capture.capture import FARTHEST
 from nlos_lit.capture.errors import CaptureError
 
+OTHER_KINDS = MappingProxyType(
+    {
+        b"\x89PNG": "a PNG picture",
+        b"\xff\xd8\xff": "a JPEG picture",
+        b"GIF8": "a GIF picture",
+        b"II*\0": "a TIFF picture",
+        b"MM\0*": "a TIFF picture",
+        b"%PDF": "a PDF",
+        b"\x93NUMPY": "a NumPy array without geometry",
+        b"PK\3\4": "a zip archive (such as .npz)",
+    }
+)
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 LARGEST = 1e30  # of a number that is read: sums of millions of them stand in single precision
 _MOST = 4096  # arrays of a file that are listed
@@ -257,8 +270,19 @@ def open_contents(path: str | Path) -> Contents:
             f"{path.name} begins like a MATLAB v7.3 file but holds no HDF5 data; it is damaged or truncated"
         )
     raise CaptureError(
-        f"{path.name} is neither HDF5, MATLAB nor Radiance HDR; found a file that begins with {head[:8]!r}"
+        f"{path.name} is {_kind(head)}; a capture is an HDF5, MATLAB or Radiance HDR file "
+        "(docs/own-data.md: how to write one)"
     )
+
+
+def _kind(head: bytes) -> str:
+    """What a file is that is no capture, by its first bytes."""
+    for start, kind in OTHER_KINDS.items():
+        if head.startswith(start):
+            return kind
+    if head.isascii() and not any(c < 32 and c not in b"\t\n\r" for c in head):
+        return "a text file"
+    return f"neither HDF5, MATLAB nor Radiance HDR: it begins with {head[:8]!r}"
 
 
 def open_folder(path: Path) -> Contents:

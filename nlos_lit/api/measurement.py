@@ -5,12 +5,12 @@ from __future__ import annotations
 import functools
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from data_modules.examine import Findings, describe, examine
-from data_modules.load import load_scene, planned_scene, reader_options
+from data_modules.load import load_scene, planned_scene, read_scene, reader_options
 from data_modules.plan import Plan, plan_capture
 from data_modules.readers import detect_format, read_capture
 from nlos_lit.api.results import Diagnosed, Picture, Surface
@@ -18,15 +18,14 @@ from nlos_lit.baselines import METHODS, reconstruct_directed
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
-from nlos_lit.model.build import PipelineSettings
 from nlos_lit.runtime.arguments import check_overrides
+from nlos_lit.runtime.command_line import quoted
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels
-from nlos_lit.training.configs import compose, settings_of
+from nlos_lit.training.configs import compose, pipeline_of, settings_of
 from nlos_lit.training.run_folder import prepare_run
 
 PHASOR, SURFELS = "phasor", "surfels"
@@ -51,7 +50,7 @@ class Measurement:
         self.format = detect_format(self.path) if self.scene["format"] == "auto" else self.scene["format"]
         options = reader_options(self.scene["reader"])
         self.capture: Capture = read_capture(self.path, self.scene["format"], options=options)
-        self._load = functools.lru_cache(maxsize=2)(_load)
+        self._load = functools.lru_cache(maxsize=2)(self._loaded_anew)
 
     @property
     def name(self) -> str:
@@ -125,20 +124,16 @@ class Measurement:
         """
         config = self._config("diagnose", *settings)
         capture, scene = self._loaded(config)
-        pipeline = BasePipeline(
-            volume=scene["volume"],
-            model=settings_of(PipelineSettings, config["model"], "model"),
-            surfels=settings_of(SurfelSettings, config["surfels"], "surfels"),
-            budget=parse_bytes(config["memory_budget"]),
-        )
+        pipeline = pipeline_of(config, scene, config["model"])
         options = settings_of(CriticismSettings, config["criticism"], "criticism")
         found, _ = diagnose(capture, pipeline, options, name=self.name, seed=config["seed"])
         return Diagnosed(self.name, found)
 
     def _surfels(self, settings: Sequence[str]) -> Surface:
         config = self._config("train", "model=surface", *settings)
-        planned = {**config, "scene": planned_scene(config["scene"], config["data_dir"], config["force"])[0]}
-        run = prepare_run(planned)
+        raw = self._raw(config["scene"], config["data_dir"])
+        scene = planned_scene(config["scene"], config["data_dir"], config["force"], raw)[0]
+        run = prepare_run({**config, "scene": scene}, raw=raw)
         phasor = run.module.pipeline.phasor
         fitted = fit_surfels(
             run.capture,
@@ -162,21 +157,16 @@ class Measurement:
     def _loaded(self, config: dict[str, Any]) -> tuple[Capture, dict[str, Any]]:
         return self._load(json.dumps(config["scene"]), config["data_dir"], config["seed"], config["force"])
 
+    def _loaded_anew(
+        self, scene: str, data_dir: str, seed: int, force: bool
+    ) -> tuple[Capture, dict[str, Any]]:
+        """The capture, ready to fit, and its scene, planned."""
+        asked = json.loads(scene)
+        raw = self._raw(asked, data_dir)
+        planned = planned_scene(asked, data_dir, force, raw)[0]
+        return load_scene(planned, data_dir, seed, force, raw)[0], planned
 
-def _load(scene: str, data_dir: str, seed: int, force: bool) -> tuple[Capture, dict[str, Any]]:
-    """The capture, ready to fit, and its scene, planned."""
-    planned = planned_scene(json.loads(scene), data_dir, force)[0]
-    return load_scene(planned, data_dir, seed, force)[0], planned
-
-
-def quoted(path: Path | str) -> str:
-    """A path as a value on Hydra's command line.
-
-    Examples:
-        >>> quoted("data/a.mat"), quoted("our lab's.mat")
-        ('data/a.mat', "'our lab\\\\'s.mat'")
-    """
-    text = str(path)
-    if all(c.isalnum() or c in "/._-" for c in text) and text.isascii():
-        return text
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+    def _raw(self, scene: Mapping[str, Any], data_dir: str) -> Capture:
+        """The file as it is: read again only where it is to be read otherwise."""
+        kept = all(scene[key] == self.scene[key] for key in ("path", "format", "reader"))
+        return self.capture if kept else read_scene(scene, data_dir)

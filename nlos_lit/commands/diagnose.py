@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 import shutil
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -16,21 +18,26 @@ from omegaconf import DictConfig
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
 from nlos_lit.commands.composed import compose_and_run
-from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.commands.split_with import second_capture, split_with
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose as diagnose_capture
 from nlos_lit.inference.diagnose import split_of
-from nlos_lit.model.build import PipelineSettings
+from nlos_lit.inference.further import open_terms
+from nlos_lit.inference.result import Diagnosis
 from nlos_lit.report.diagnosis_figures import diagnosis_figures
 from nlos_lit.report.page import log_figures, write_report
 from nlos_lit.report.verdict import verdict
 from nlos_lit.runtime.claim import claim
-from nlos_lit.runtime.command_line import output_folder, quote_numbers, sentence_errors, stay_in_run
-from nlos_lit.runtime.memory import parse_bytes
+from nlos_lit.runtime.command_line import (
+    output_folder,
+    quote_numbers,
+    sentence_errors,
+    stay_in_run,
+    typed,
+)
 from nlos_lit.runtime.progress import StepTicker
 from nlos_lit.runtime.threads import choose_threads
-from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.training.configs import register_settings, settings_of
+from nlos_lit.training.configs import pipeline_of, register_settings, settings_of
 from nlos_lit.training.explored import mark_interrupted
 from nlos_lit.training.folder import begun_with, resolved, take_folder, take_given_folder, write_config
 from nlos_lit.training.run_folder import Run, open_run
@@ -56,30 +63,55 @@ def prepare(arguments: list[str]) -> None:
 def diagnose(config: DictConfig) -> None:
     """Diagnose a capture, or the one of a finished run, as ``conf/diagnose.yaml`` says, and write the report.
 
+    Where ``split_with`` names another capture, it is asked which of the names that are open stay.
+
     Raises:
         UserError: the data or the settings cannot work, or there is a diagnosis already.
     """
     began = time.perf_counter()
-    folder = output_folder()
+    folder = output_folder() if config.run is None else Path(config.run)
     choose_threads(config.threads)
-    run, settings = None, resolved(config)
+    settings = resolved(config)
+    done = folder / "diagnosis" / "diagnosis.json"
+    if config.split_with is None:
+        diagnose_first(config, settings, folder)
+    else:
+        again = config.run is not None and done.exists()
+        if again:
+            claim(folder)
+            open_terms(Diagnosis.read(done))
+        # What cannot be read is told before the first capture takes its time.
+        second = second_capture(settings, None if config.run is None else folder)
+        if not again:
+            diagnose_first(config, settings, folder)
+        split_with(settings, folder, second, scene_settings(config, folder))
+    page = folder / "diagnosis" / "report.html"
+    log.info("%.0f s; %s (%s %s)", time.perf_counter() - began, page, typed("view"), shlex.quote(str(folder)))
+
+
+def diagnose_first(config: DictConfig, settings: dict[str, Any], folder: Path) -> None:
+    """Diagnose one capture and write the report.
+
+    Args:
+        config: of the command.
+        settings: the same, resolved.
+        folder: of the run.
+
+    Raises:
+        UserError: the data or the settings cannot work, or there is a diagnosis already.
+    """
+    run = None
     if config.run is None:
         take_folder(folder)
         write_config(settings, folder)
         scene, model = settings["scene"], settings["model"]
         capture = load_scene(scene, settings["data_dir"], settings["seed"], settings["force"])[0]
     else:
-        folder = Path(config.run)
         claim(folder)
         run = _undiagnosed(folder)
         scene, model, capture = run.config["scene"], run.config["model"], run.capture
     options = settings_of(CriticismSettings, settings["criticism"], "criticism")
-    pipeline = BasePipeline(
-        volume=scene["volume"],
-        model=settings_of(PipelineSettings, model, "model"),
-        surfels=settings_of(SurfelSettings, settings["surfels"], "surfels"),
-        budget=parse_bytes(settings["memory_budget"]),
-    )
+    pipeline = pipeline_of(settings, scene, model)
     image = None
     if run is not None:
         with torch.no_grad():
@@ -112,11 +144,10 @@ def diagnose(config: DictConfig) -> None:
         sys.exit(130)
     given = scene_settings(config, folder)
     watched.finish(found, diagnosis, given)
-    page = write_report(diagnosis, folder / "diagnosis", scene=given)
+    write_report(diagnosis, folder / "diagnosis", scene=given)
     shutil.rmtree(folder / "diagnosis" / "steps")
     log_figures(folder, diagnosis_figures(diagnosis))
     log.info("%s", verdict(diagnosis))
-    log.info("%.0f s; %s", time.perf_counter() - began, page)
 
 
 def scene_settings(config: DictConfig, folder: Path) -> list[str]:

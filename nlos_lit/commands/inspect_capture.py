@@ -32,7 +32,7 @@ def main(arguments: list[str]) -> int:
             raise UserError(f"cannot write {picture}: {error.strerror or error}") from error
         print(f"picture      {picture}")
     except UserError as error:
-        print(error, file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 2
     return 0
 

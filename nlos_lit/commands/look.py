@@ -57,8 +57,8 @@ def look(arguments: list[str]) -> None:
         )
     file, settings = given[0], given[1:]
     logging.getLogger("data_modules").setLevel(logging.WARNING)  # the plan is part of what is printed
-    choose_threads(None)
     measured = Measurement(file, settings)
+    choose_threads(None)
     print(printable(str(measured)))
     named = [word.removeprefix("out=") for word in arguments if word.startswith("out=")]
     folder = Path(named[-1]) if named else Path("outputs") / measured.name / "look"

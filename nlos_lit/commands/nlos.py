@@ -24,6 +24,7 @@ class Command:
         module: of ``nlos_lit.commands``, whose ``main`` takes the arguments and returns the exit status; None
             is that of the command's own name.
         settings: its arguments are ``KEY=VALUE``, looked over before the module is loaded.
+        paths: its words are files or folders, which are looked for before the module is loaded.
     """
 
     does: str
@@ -31,6 +32,7 @@ class Command:
     more: str = ""
     module: str | None = None
     settings: bool = False
+    paths: bool = False
 
     @property
     def about(self) -> str:
@@ -45,6 +47,15 @@ random=7 (docs/simulator.md). With physical effects, each with strengths as EFFE
 (docs/effects.md):
 
     nlos simulate scene=letters 'effects=[pile_up]' pile_up.detections=0.3 out=X.hdf5
+"""
+DIAGNOSE = """\
+Where it leaves two names open, the report says which further capture would tell. Taken, it is asked by
+
+    nlos diagnose RUN --split-with FILE
+
+RUN is the folder of the first diagnosis (or the first capture's file, which is diagnosed first). The second
+capture is read as the first was; settings of the scene that differ are given behind it, such as
+scene.reader.scan_order=columns.
 """
 RESULTS = """\
 Names are experiments, all, or page, which rewrites the generated parts of docs/results.md from what is
@@ -61,15 +72,17 @@ COMMANDS = MappingProxyType(
         "look": Command(
             "look at a capture file: recognise, check, plan and picture it, and say what to do next",
             "FILE",
+            paths=True,
         ),
-        "train": Command("reconstruct a hidden scene by self-calibration", "scene=su", settings=True),
+        "train": Command("reconstruct a hidden scene by self-calibration", "FILE", settings=True),
         "diagnose": Command(
-            "say what the simulation gets wrong about a capture, or about a finished run (run=FOLDER)",
-            "scene=su",
+            "say what the simulation gets wrong about a capture, or about a finished run",
+            "FILE",
+            more=DIAGNOSE,
             settings=True,
         ),
         "reconstruct": Command(
-            "reconstruct by a classical method, without fitting", "scene=su method=lct", settings=True
+            "reconstruct by a classical method, without fitting", "FILE method=lct", settings=True
         ),
         "simulate": Command(
             "simulate a capture of a hidden scene",
@@ -77,9 +90,11 @@ COMMANDS = MappingProxyType(
             more=SIMULATE,
             settings=True,
         ),
-        "inspect": Command("print and plot what a capture file holds", "FILE", module="inspect_capture"),
-        "compare": Command("show where finished runs differ, and what came out", "RUN RUN"),
-        "view": Command("open the page of a run or a diagnosis", "RUN"),
+        "inspect": Command(
+            "print and plot what a capture file holds", "FILE", module="inspect_capture", paths=True
+        ),
+        "compare": Command("show where finished runs differ, and what came out", "RUN RUN", paths=True),
+        "view": Command("open the page of a run or a diagnosis", "RUN", paths=True),
         "results": Command(
             "make the paper's tables and figures",
             "table1 size=reduced",
@@ -130,13 +145,29 @@ def open_command(name: str, arguments: list[str]) -> int:
         The exit status.
     """
     command = COMMANDS[name]
+    if command.paths and (missing := _missing(arguments)):
+        what = "capture file" if command.example == "FILE" else "folder that a run has named at its end"
+        print(f"error: {missing} does not exist; give a {what}", file=sys.stderr)
+        return 2
     if command.settings:
         from nlos_lit.runtime.arguments import look_over
+        from nlos_lit.runtime.command_line import sentence_errors, words_as_settings
 
+        arguments = sentence_errors(words_as_settings)(name, arguments)
         look_over(name, arguments, command.about)
     module = importlib.import_module(f"nlos_lit.commands.{command.module or name}")
     status: int = module.main(arguments)
     return status
+
+
+def _missing(arguments: list[str]) -> str | None:
+    """The first word that names neither a file nor a folder; options end the words that are looked at."""
+    for word in arguments:
+        if word.startswith("-"):
+            return None
+        if "=" not in word and not os.path.exists(word):
+            return word
+    return None
 
 
 def listed() -> str:

@@ -307,3 +307,4 @@ def _tell(summary: Mapping[str, Any], folder: Path) -> None:
                 for name, q in reported.items()
             )
             log.info("%s: %s", effect, ", ".join(values))
+    log.info("to look at it: %s %s", typed("view"), shlex.quote(str(folder)))

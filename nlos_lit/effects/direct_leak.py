@@ -31,6 +31,7 @@ class DirectLeak(Effect):
     """
 
     name = "direct_leak"
+    with_power = ("amplitude",)
     words = EffectWords(
         phrase="direct light that leaks into the gate",
         cause="The end of the very bright first return is still there when the gate opens.",

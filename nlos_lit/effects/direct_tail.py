@@ -46,6 +46,7 @@ class DirectTail(Effect):
     """
 
     name = "direct_tail"
+    with_power = ("amplitude",)
     words = EffectWords(
         phrase="direct light that strays from the laser's spot into the gate",
         cause="The very bright first return at the laser's spot is scattered within the detector's optics, "

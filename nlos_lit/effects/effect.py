@@ -36,6 +36,9 @@ class Effect(nn.Module, Hooks):
             what is reported.
         in_runs: of such an effect, neighbouring spots may share their numbers. Otherwise only what a spot has
             over its neighbours counts.
+        lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
+            it with the same values.
+        with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
         needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
@@ -48,6 +51,8 @@ class Effect(nn.Module, Hooks):
     witness: ClassVar[Literal["energy", "tail", "delay"] | None] = None
     per_spot: ClassVar[bool] = False
     in_runs: ClassVar[bool] = False
+    lasting: ClassVar[bool] = False
+    with_power: ClassVar[tuple[str, ...]] = ()
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False
@@ -67,6 +72,7 @@ class Effect(nn.Module, Hooks):
         # Per-spot effects: of their distribution, and how many spots have it.
         self.width, self.share = 0.0, 1.0
         self.prior_scale = 1.0  # of all prior deviations
+        self.known: dict[str, tuple[Tensor, Tensor]] = {}  # stored values and their errors, of other captures
         self.reset()
 
     @classmethod
@@ -141,14 +147,33 @@ class Effect(nn.Module, Hooks):
         parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]
         return torch.cat(parts) if parts else torch.zeros(0)
 
+    def begin_at(self, name: str, value: Tensor, error: Tensor) -> None:
+        """Begin at values that another capture gave, and stay there within their errors.
+
+        Args:
+            name: of the parameter.
+            value: ``[size]``, in the parameter's unit.
+            error: ``[size]``, likewise.
+        """
+        self.set(name, value)
+        stored = getattr(self, f"raw_{name}").detach().clone()
+        self.known[name] = stored, error / self.declared[name].scale
+
     def penalty(self) -> Tensor:
-        """Nats that the prior takes for the present values: ``½ Σ (value/deviation)²``; 0 at the null."""
+        """Nats that the prior takes for the present values, and what is known of other captures.
+
+        ``½ Σ (value/deviation)²``, 0 at the null, and ``½ Σ ((value - known)/error)²``.
+        """
         total = torch.zeros(())
         for p in self.declared.values():
             if p.prior:
                 raw = getattr(self, f"raw_{p.name}")
                 off = raw - (p.null or 0.0) / p.scale
                 total = total.to(raw.device) + 0.5 * (self._precision(p).to(raw.device) * off.square()).sum()
+        for name, (stored, error) in self.known.items():
+            raw = getattr(self, f"raw_{name}")
+            off = (raw - stored.to(raw.device)) / error.to(raw.device)
+            total = total.to(raw.device) + 0.5 * off.square().sum()
         return total
 
     def _precision(self, p: Parameter) -> Tensor:

@@ -162,12 +162,15 @@ class FreeRate(FreeTerm):
     def basis(cls, scan: Scan) -> Tensor:
         return torch.eye(cls.KNOTS)
 
-    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+    def tents(self, expected: Tensor) -> Tensor:
+        """``[B, KNOTS]`` weight of each knot at spots of ``expected`` ``[B, T]`` counts."""
         rate = (expected.sum(1) / self.scan.mean_counts).clamp_min(1e-6).log()
         place = (rate - RATES[0]) / (RATES[1] - RATES[0]) * (self.KNOTS - 1)
         knots = torch.arange(self.KNOTS, device=expected.device)
-        tents = (1 - (place.clamp(0, self.KNOTS - 1)[:, None] - knots).abs()).clamp_min(0)
-        return expected * torch.exp(tents @ self.value("field").reshape(-1))[:, None]
+        return (1 - (place.clamp(0, self.KNOTS - 1)[:, None] - knots).abs()).clamp_min(0)
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        return expected * torch.exp(self.tents(expected) @ self.value("field").reshape(-1))[:, None]
 
 
 class FreeScanBackground(_FreeBackground):
@@ -260,16 +263,16 @@ class _FreeResponse(FreeTerm):
     def alone(self) -> Effect:
         return _EqualResponse(self.scan)
 
-    def _weights(self) -> Tensor:
-        """``[K_spot, 4]`` coefficients."""
-        return self.value("field").reshape(self.functions.shape[1], -1)
+    def weights(self) -> Tensor:
+        """``[S, 4]`` of the changes at each spot."""
+        return self.functions @ self.value("field").reshape(self.functions.shape[1], -1)
 
     def values(self) -> Tensor:
         """``[S, T]`` what becomes of light that arrives when the gate opens."""
-        return self.functions @ self._weights() @ self.kernels[:, :, self.scan.gate[0]]
+        return self.weights() @ self.kernels[:, :, self.scan.gate[0]]
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        weights = self.functions[spots] @ self._weights()
+        weights = self.weights()[spots]
         changed = torch.einsum("ktu,bu->bkt", self.kernels, signal)
         return (signal + torch.einsum("bk,bkt->bt", weights, changed)).clamp_min(0)
 

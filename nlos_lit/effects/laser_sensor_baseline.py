@@ -29,6 +29,7 @@ class LaserSensorBaseline(Effect):
     """
 
     name = "laser_sensor_baseline"
+    lasting = True
     words = EffectWords(
         phrase="laser and sensor spots that do not coincide",
         cause="The detector looks beside the point that the laser lights.",

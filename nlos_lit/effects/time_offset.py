@@ -28,6 +28,7 @@ class TimeOffset(Effect):
     """
 
     name = "time_offset"
+    lasting = True
     words = EffectWords(
         phrase="a wrong time zero",
         cause="Cables, trigger or a re-zeroed histogram shift all arrival times by the same amount.",

@@ -29,6 +29,7 @@ class WallReflectance(SmoothEffect):
     """
 
     name = "wall_reflectance"
+    lasting = True
     words = EffectWords(
         phrase="a relay wall that is brighter in some places than in others",
         cause="Paint, stains or texture change how much light each wall point passes on.",

@@ -40,6 +40,7 @@ class WallScale(Effect):
     """
 
     name = "wall_scale"
+    lasting = True
     words = EffectWords(
         phrase="a scan that is larger or smaller than stated",
         cause="The side of the scanned square was measured wrongly, or the scanner's angles are not what "

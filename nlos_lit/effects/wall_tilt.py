@@ -28,6 +28,7 @@ class WallTilt(Effect):
     """
 
     name = "wall_tilt"
+    lasting = True
     words = EffectWords(
         phrase="a relay wall that is tilted against the scan's plane",
         cause="The scanned points stand nearer or farther than assumed, so paths are longer on one side.",

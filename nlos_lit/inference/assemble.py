@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,24 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn
+from nlos_lit.inference.advise import expected_nats
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.inference.distil import Follower
 from nlos_lit.inference.heldout import Comparison, score
 from nlos_lit.inference.pool import Candidate, tested_rows
 from nlos_lit.inference.residuals import SIDE, profiles
-from nlos_lit.inference.result import Accepted, Diagnosis, Gain, Screened, Shape, Unexplained
+from nlos_lit.inference.result import (
+    Accepted,
+    Diagnosis,
+    Followed,
+    Gain,
+    Screened,
+    Shape,
+    Tried,
+    Unexplained,
+)
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty
@@ -37,6 +51,7 @@ def assemble(
     name: str,
     seconds: float,
     seed: int,
+    followers: Mapping[str, Follower] = MappingProxyType({}),
 ) -> Diagnosis:
     """Everything the report says.
 
@@ -50,6 +65,7 @@ def assemble(
         name: of the capture.
         seconds: the diagnosis took.
         seed: of it.
+        followers: formulas of the free terms, by these terms' names.
 
     Returns:
         The result, as it is written and shown.
@@ -59,8 +75,13 @@ def assemble(
     spots = split.fit[rows]
     block = torch.from_numpy(split.block[spots])
     share = len(rows) / len(split.fit)
-    uncertainty = Uncertainty(final, torch.from_numpy(spots), final.counts[rows], block, share)
-    accepted = [_accepted(turn, found, uncertainty, split, scan) for turn in found.accepted]
+
+    def uncertainty_of(fit: SurfelFit) -> Uncertainty:
+        return Uncertainty(fit, torch.from_numpy(spots), fit.counts[rows], block, share)
+
+    uncertainty = uncertainty_of(final)
+    followed = {name: _followed(f, uncertainty_of(f.fit)) for name, f in followers.items()}
+    accepted = [_accepted(turn, found, uncertainty, split, scan, followed) for turn in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
     first = found.turns[0].candidates
@@ -85,14 +106,28 @@ def assemble(
         if null is None
         else null.chance(largest),
         notes=[],
-        capture=_facts(capture, name),
+        capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
     )
 
 
-def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Split, scan: Scan) -> Accepted:
+def _followed(follower: Follower, uncertainty: Uncertainty) -> Followed:
+    formula = next(e for e in follower.fit.extension.effects if e.name == follower.name)
+    assert isinstance(formula, Formula)
+    parameters = uncertainty.parameters(formula, None)
+    return Followed(follower.name, formula.equation, parameters, follower.share, follower.offered)
+
+
+def _accepted(
+    turn: Turn,
+    found: Findings,
+    uncertainty: Uncertainty,
+    split: Split,
+    scan: Scan,
+    followed: Mapping[str, Followed],
+) -> Accepted:
     trial, confirmed = turn.best, turn.confirmed
     assert trial is not None  # what makes a turn one of these
     assert confirmed is not None
@@ -110,10 +145,70 @@ def _accepted(turn: Turn, found: Findings, uncertainty: Uncertainty, split: Spli
         heldout_gain=_gain(found.final, found.losses[trial.name], split),
         weights={name: weight / total for name, weight in weights.items()},
         split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
+        advised=_advised(effect.name, list(weights), turn.trials),
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
+        formula=followed.get(effect.name),
         needed=confirmed.needed,
+        tried={name: _tried(name, turn.trials, split) for name in weights},
     )
+
+
+def _advised(name: str, names: list[str], trials: list[Trial]) -> dict[str, float]:
+    """What captures would tell of a term and the hardest of its rivals; those of single spots aside."""
+    tried = {t.name: t.fit for t in trials if t.candidate is not None and not t.candidate.effect.per_spot}
+    rivals = [rival for rival in names if rival != name and rival in tried]
+    if name not in tried or not rivals:
+        return {}
+    told = [expected_nats(tried[name], tried[rival], (name, rival)) for rival in rivals]
+    return {plan: min(each[plan] for each in told) for plan in told[0]}
+
+
+def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
+    trial = next(t for t in trials if t.name == name)
+    none = next(t for t in trials if t.candidate is None)
+    assert trial.candidate is not None
+    return tried_with(trial.candidate, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
+
+
+def tried_with(candidate: Candidate, fit: SurfelFit, nats: list[float]) -> Tried:
+    """What is kept of a term that was tried.
+
+    Args:
+        candidate: as the pool saw it.
+        fit: that went on with it.
+        nats: of each wall block.
+
+    Returns:
+        The record; with values where another capture of the same wall has them alike.
+    """
+    effect = next(e for e in fit.extension.effects if e.name == candidate.name)
+    if not effect.lasting:
+        return Tried(nats)
+    sizes = [p.size for p in effect.amplitudes]
+    errors = [
+        (p.scale * part.float()).tolist()
+        for p, part in zip(effect.amplitudes, candidate.error.split(sizes), strict=True)
+    ]
+    names = [p.name for p in effect.amplitudes]
+    values = {name: effect.value(name).detach().reshape(-1).tolist() for name in names}
+    return Tried(nats, values, dict(zip(names, errors, strict=True)))
+
+
+def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
+    """What one fit gains over another on each block of select spots.
+
+    Args:
+        before: ``[S]`` nats of the select spots.
+        after: ``[S]`` of the same.
+        split: of the spots.
+
+    Returns:
+        One number a block.
+    """
+    names, index = np.unique(split.block[split.select], return_inverse=True)
+    gain = torch.zeros(len(names), dtype=torch.float64)
+    return gain.index_add_(0, torch.from_numpy(index), (after - before).double()).tolist()
 
 
 def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
@@ -216,9 +311,11 @@ def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
     return (total / spots[:, None]).numpy()
 
 
-def _facts(capture: Capture, name: str) -> dict[str, Any]:
+def facts_of(capture: Capture, name: str) -> dict[str, Any]:
     first, last = capture.gate
     order = capture.scan_order
+    points = capture.sensor if np.ptp(capture.sensor, axis=0).max() > 0 else capture.laser
+    low, high = points.min(axis=0), points.max(axis=0)
     return {
         "name": name,
         "kind": capture.kind,
@@ -226,6 +323,7 @@ def _facts(capture: Capture, name: str) -> dict[str, Any]:
         "bins": capture.n_bins,
         "bin_length": capture.bin_length,
         "bin_width_ps": capture.bin_width_ps,
+        "wall": [round(float(v), 4) for v in (low[0], high[0], low[1], high[1])],
         "counts_per_spot": float(capture.counts[:, first:last].sum() / capture.n_spots),
         "gate": list(capture.gate),
         "scan_order": "raster" if np.array_equal(order, np.arange(len(order))) else "as given",

@@ -266,6 +266,20 @@ def solve_spots(fit: SurfelFit) -> SurfelFit:
     return fit
 
 
+def go_on(fit: SurfelFit) -> SurfelFit:
+    """Some more batches, at falling rates.
+
+    Args:
+        fit: that goes on, in place.
+
+    Returns:
+        the same fit.
+    """
+    solve_spots(fit)
+    fit.run(1, steps=WARM, settle=False)
+    return solve_spots(fit)
+
+
 class Loop:
     """All turns of one capture.
 
@@ -318,8 +332,8 @@ class Loop:
         rivals = leaders([c for c in candidates if c.loud > bars[c.name]], s.rivals)
         if not rivals:
             return turn
-        jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
-        jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
+        jobs: list[Job] = [("going on without another term", None, partial(self.warm, fit, []))]
+        jobs += [(f"going on with {c.name}", c, partial(self.warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
         return self._chosen(replace(turn, trials=trials), trials)
 
@@ -434,9 +448,9 @@ class Loop:
             for text, make in (
                 (
                     f"with {name}",
-                    lambda: self._go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
+                    lambda: go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
                 ),
-                (f"without {name}", lambda: self._warm(fine, [])),
+                (f"without {name}", lambda: self.warm(fine, [])),
             )
         ]
         return found[0], found[1]
@@ -498,20 +512,22 @@ class Loop:
         number = min(len(self.split.fit), self.settings.spots)
         return max(0.0, sum(misfit_of(fit, spots, number) for spots in parts) / len(parts))
 
-    def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
-        """The same scene, gone on with more terms."""
-        return self._go_on(fit.copy(begun_with(fit, extra), self.seed))
+    def warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
+        """The same scene, gone on with more terms.
+
+        Args:
+            fit: that is copied.
+            extra: the terms, begun where the pool saw them.
+
+        Returns:
+            another fit.
+        """
+        return go_on(fit.copy(begun_with(fit, extra), self.seed))
 
     def _without(self, fit: SurfelFit, name: str) -> SurfelFit:
         """The same scene, gone on without a term."""
         fewer = [e for e in copy_effects(fit.extension, []).effects if e.name != name]
-        return self._go_on(fit.copy(Extension(fewer), self.seed))
-
-    @staticmethod
-    def _go_on(fit: SurfelFit) -> SurfelFit:
-        solve_spots(fit)
-        fit.run(1, steps=WARM, settle=False)
-        return solve_spots(fit)
+        return go_on(fit.copy(Extension(fewer), self.seed))
 
     def _trials(self, jobs: list[Job]) -> list[Trial]:
         named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]
@@ -534,7 +550,7 @@ class Loop:
         names = [e.name for e in fit.extension.effects]
         if not names:
             return {}
-        jobs = [("going on with all", "all", partial(self._warm, fit, []))]
+        jobs = [("going on with all", "all", partial(self.warm, fit, []))]
         jobs += [(f"going on without {n}", f"all_but_{n}", partial(self._without, fit, n)) for n in names]
         self.steps.plan(fit=len(jobs))
         fits = self.steps.several("fit", jobs, self.settings.processes)

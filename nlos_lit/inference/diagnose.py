@@ -16,7 +16,8 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Turn, criticise
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Loop, Turn, criticise
+from nlos_lit.inference.distil import distil
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
@@ -107,9 +108,10 @@ def diagnose(
         return again
 
     found = criticise(base, rebuild, pipeline.grow, split, scan, options, seed, steps, partial(told, image))
+    followers = distil(Loop(rebuild, pipeline.grow, split, scan, options, seed, steps), found)
     null = None
     if options.toys:
         assert folder is not None, "toys are kept in a folder"
         null = run_toys(capture, base, pipeline, split, options, folder / "toys", report)
     seconds = time.perf_counter() - began + steps.earlier
-    return assemble(capture, found, split, scan, options, null, name, seconds, seed), found
+    return assemble(capture, found, split, scan, options, null, name, seconds, seed, followers), found

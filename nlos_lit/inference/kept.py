@@ -11,6 +11,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.formulas import FORMULAS
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.pool import Candidate
 from nlos_lit.runtime.plain_file import Kind, record
@@ -45,7 +46,7 @@ def _parts(effect: Effect) -> dict[str, Any]:
 def _effect(
     scan: Scan, name: str, stored: dict[str, torch.Tensor], numbers: dict[str, float], moves: bool
 ) -> Effect:
-    effect = next(cls for cls in [*EFFECTS, *FREE] if cls.name == name)(scan)
+    effect = next(cls for cls in [*EFFECTS, *FREE, *FORMULAS] if cls.name == name)(scan)
     own = dict(effect.named_parameters())
     if set(own) != set(stored) or set(_numbers(effect)) != set(numbers):
         raise ValueError(f"these are no values of {name}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -113,7 +113,9 @@ def patches_for(rows: int) -> int:
     return int((WORK / rows) ** 0.5 / 2)
 
 
-def ask(fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int) -> list[Candidate]:
+def ask(
+    fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int, only: Container[str] | None = None
+) -> list[Candidate]:
     """Every term that the fit does not have yet, most evidence first.
 
     Args:
@@ -122,13 +124,15 @@ def ask(fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int) -> list[
         scan: of the capture.
         most: fitted spots that are looked at.
         seed: of their choice.
+        only: names of those that are asked; None asks all.
 
     Returns:
         one candidate a term, with a copy of it at its best shape.
     """
     problem, block = _problem(fit, split, most, seed)
     have = {e.name for e in fit.extension.effects}
-    return screen(problem, [e(scan) for e in [*EFFECTS, *FREE] if e.name not in have], block)
+    terms = [e for e in [*EFFECTS, *FREE] if only is None or e.name in only]
+    return screen(problem, [e(scan) for e in terms if e.name not in have], block)
 
 
 def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) -> tuple[float, float]:

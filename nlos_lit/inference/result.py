@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+import json
+import math
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
+from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.io.files import plain
 from nlos_lit.metrics.transients import Scores
+
+LARGEST = 2**28  # bytes of a diagnosis
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,38 @@ class Shape:
 
 
 @dataclass(frozen=True)
+class Followed:
+    """The formula that comes nearest to a free term, see :mod:`nlos_lit.inference.distil`.
+
+    Args:
+        name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
+        share: of the free term's gain on spots that were not fitted.
+        offered: it keeps enough to be an effect of its own.
+    """
+
+    name: str
+    equation: str
+    parameters: dict[str, Estimate]
+    share: float
+    offered: bool
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A term as it was tried beside a scene.
+
+    Args:
+        nats: gained over none, one number for each held-out wall block of each capture.
+        values: of its amplitudes, by name, in their units, if they are the same in other captures.
+        errors: of these.
+    """
+
+    nats: list[float]
+    values: dict[str, list[float]] = field(default_factory=dict)
+    errors: dict[str, list[float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Accepted:
     """A term that the model was extended with: an effect of the registry, or a free term.
 
@@ -67,8 +107,11 @@ class Accepted:
             what weighs too little is left out.
         split_by: the measurement that would tell those apart.
         axis: of a free term, else empty.
-        shape: of a free term.
+        shape: of a free term. formula: that it follows best; None where none was asked for.
         needed: nats of evidence that this term needed; None for those of all others.
+        tried: the names of ``weights`` as they were tried, each beside the same scene.
+        advised: nats that captures as long as this one are expected to tell between the term and the rival
+            that is hardest to tell from it, by what is done in them, see :mod:`nlos_lit.inference.advise`.
     """
 
     name: str
@@ -79,7 +122,10 @@ class Accepted:
     split_by: str = ""
     axis: str = ""
     shape: Shape | None = None
+    formula: Followed | None = None
     needed: float | None = None
+    tried: dict[str, Tried] = field(default_factory=dict)
+    advised: dict[str, float] = field(default_factory=dict)
 
     @property
     def confusable_with(self) -> list[str]:
@@ -137,6 +183,29 @@ class Profile:
 
 
 @dataclass(frozen=True)
+class Further:
+    """What another capture said of names that were open.
+
+    Args:
+        name: of that capture.
+        asked: names that were open, the accepted one first.
+        nats: what each gains there over none of them, on wall blocks that were not fitted.
+        held: names whose values were to stay, within their errors, what they were before.
+        seen: that capture asks for any of them by itself.
+        weights: of all captures together, by name.
+        stays: names that are left, the accepted one first.
+    """
+
+    name: str
+    asked: list[str]
+    nats: dict[str, float]
+    held: list[str]
+    seen: bool
+    weights: dict[str, float]
+    stays: list[str]
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Everything that ``diagnose.py`` found.
 
@@ -147,6 +216,7 @@ class Diagnosis:
         needed: nats of evidence that a term of this pool needed.
         chance: of evidence as large as the largest, without any effect: counted over ``toys``; without toys
             what the theory says.
+        further: what other captures said of the groups.
     """
 
     effects: list[Accepted]
@@ -166,7 +236,49 @@ class Diagnosis:
     toys: int
     seconds: float
     seed: int
+    further: list[Further] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-serialisable."""
         return plain(self)
+
+    @staticmethod
+    def read(file: Path) -> Diagnosis:
+        """What :meth:`to_dict` gave, from a file.
+
+        Args:
+            file: ``diagnosis.json``.
+
+        Returns:
+            The same; values that were infinite or none are NaN.
+
+        Raises:
+            UserError: the file is missing, damaged, or of an earlier version.
+        """
+        try:
+            return cast(Diagnosis, _made(Diagnosis, json.loads(bounded(file, LARGEST))))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            raise UserError(
+                f"{file} holds no diagnosis of this version; diagnose the capture again"
+            ) from error
+
+
+def _made(kind: Any, value: Any) -> Any:
+    """A value of a type, from its plain form."""
+    if is_dataclass(kind):
+        known = get_type_hints(kind)
+        return cast(type, kind)(**{f.name: _made(known[f.name], value[f.name]) for f in fields(kind)})
+    inside = get_args(kind)
+    if get_origin(kind) is UnionType:
+        return None if value is None else _made(next(i for i in inside if i is not NoneType), value)
+    if get_origin(kind) is list:
+        return [_made(inside[0], one) for one in value]
+    if get_origin(kind) is dict:
+        return {key: _made(inside[1], one) for key, one in value.items()}
+    if get_origin(kind) is tuple:
+        return tuple(_made(one, v) for one, v in zip(inside, value, strict=True))
+    if kind is np.ndarray:
+        return np.array(value, dtype=np.float64)
+    if kind is float:
+        return math.nan if value is None else float(value)
+    return value

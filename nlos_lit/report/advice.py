@@ -5,11 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from nlos_lit.inference.advise import AGAIN
 from nlos_lit.inference.criticise import Turn
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.report.quantities import number, percent
-from nlos_lit.report.verdict import at_noise, excess_share, invisible, rivals
+from nlos_lit.report.verdict import at_noise, excess_share, follows, invisible, rivals
 from nlos_lit.report.words import describe
 
 # What tells where something without a name comes from, by the axis that it lies along.
@@ -29,6 +31,7 @@ TELLS = {
     " over it shows there without any scene.",
     "spot": "Record the same capture again: what comes back at the same spots belongs to them.",
 }
+MORE = 2.0  # times what the same scan again tells, from which on another capture is advised
 FINDER = "See whether the shape below follows anything you know of the rig, and record the capture again."
 
 
@@ -78,36 +81,40 @@ def confidence(diagnosis: Diagnosis) -> str:
     return text
 
 
-def next_step(diagnosis: Diagnosis, scene: Sequence[str] = ()) -> Advice:
+def next_step(diagnosis: Diagnosis, scene: Sequence[str] = (), folder: Path | None = None) -> Advice:
     """The one thing to do first.
 
     Args:
         diagnosis: the whole.
         scene: settings of the command line that name the scene.
+        folder: of the run that was diagnosed; None where it is not known.
 
     Returns:
         on the rig, or at the keyboard.
     """
-    base = ["python", "train.py", *scene]
+    base = ["nlos", "train", *scene]
     found = sorted(diagnosis.effects, key=_gain, reverse=True)
     if found:
         first = found[0]
         known = shlex.join([*base, f"effects=[{','.join(e.name for e in diagnosis.effects)}]"])
         others = rivals(diagnosis, first)
         if others and first.split_by:
+            asked = "" if folder is None else f"nlos diagnose {shlex.quote(str(folder))} --split-with FILE\n"
             return Advice(
-                f"Tell the candidates apart: take {first.split_by}, and diagnose it. Until then the"
-                " reconstruction can be made with the first of them in the model:",
-                known,
+                f"Tell the candidates apart: take {first.split_by}.{advised(first)}"
+                + (" Where that is a capture of the scene, the first command asks it." if asked else "")
+                + " Until then the reconstruction can be made with the first of them in the model:",
+                asked + known,
             )
         remedy = describe(first.name).words.remedy
         more = " Then the next one." if len(found) > 1 else ""
         return Advice(f"{remedy}{more} Or leave the rig as it is and put it into the model:", known)
     if diagnosis.unknown:
         worst = max(diagnosis.unknown, key=_gain)
+        known = f" {follows(worst)}" if worst.formula is not None and worst.formula.offered else ""
         return Advice(
             f"{TELLS.get(worst.axis, FINDER)} Until it has a name, read the picture with care where the"
-            " residual below stands out."
+            f" residual below stands out.{known}"
         )
     refined = shlex.join([*base, "refine=true"])
     if at_noise(diagnosis):
@@ -120,6 +127,24 @@ def next_step(diagnosis: Diagnosis, scene: Sequence[str] = ()) -> Advice:
         " stands out (scene.volume.depth), and let a finer surface try:",
         refined,
     )
+
+
+def advised(term: Accepted) -> str:
+    """Which capture would tell a term from its rivals, as worked out beforehand.
+
+    Args:
+        term: that was accepted.
+
+    Returns:
+        A sentence that begins with a space; empty where nothing was worked out.
+    """
+    if not term.advised:
+        return ""
+    again, best = term.advised[AGAIN], max(term.advised, key=lambda plan: term.advised[plan])
+    if term.advised[best] < MORE * again:
+        return f" By calculation the same scan again would tell as much as others: {number(again, 2)} nats."
+    most = number(term.advised[best], 2)
+    return f" By calculation {best} would tell {most} nats, the same scan again {number(again, 2)}."
 
 
 def told_turn(count: int, turn: Turn) -> str:

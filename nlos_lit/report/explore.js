@@ -52,16 +52,25 @@
   const left = (n, m) => (sigma ? (m > 0 ? (n - m) / Math.sqrt(m) : n > 0 ? NaN : 0) : n - m);
   function residual(k, spot, from, to) { return left(sum(counts, spot, from, to), sum(models[k], spot, from, to)); }
 
-  // What is chosen; kept over a reload while the run goes on.
+  // What is chosen and looked at; kept over a reload while the run goes on.
   const place = "explore " + facts.name + " " + (facts.origin ? facts.origin.command : "");
   const state = Object.assign(
-    { what: "counts", bin: -1, spot: middle(), axis: "z", slice: -1, level: 30, camera: null, live: true },
+    { what: "counts", bin: -1, spot: middle(), axis: "z", slice: -1, level: 30, camera: null, live: true,
+      layers: {}, profile: null, scroll: 0, focus: null },
     restored(),
   );
   if (!(state.spot >= 0 && state.spot < S)) state.spot = middle();
   if (state.bin >= T) state.bin = -1;
   function restored() { try { return JSON.parse(sessionStorage.getItem(place)) || {}; } catch { return {}; } }
   function remember() { try { sessionStorage.setItem(place, JSON.stringify(state)); } catch { /* not kept */ } }
+  /* All that has no event of its own: where the eye stands, how far the page is scrolled, what has the keyboard. */
+  function leave() {
+    const told = at("hidden")._fullLayout;
+    if (told && told.scene && told.scene._scene) state.camera = camera();
+    state.scroll = window.scrollY;
+    state.focus = document.activeElement ? document.activeElement.id : null;
+    remember();
+  }
   function middle() {
     const near = header.wall.x.length >> 1, high = header.wall.y.length >> 1;
     const found = array.wall[high * header.wall.x.length + near];
@@ -102,7 +111,7 @@
   const shown3d = [];
   function scene() {
     const traces = [];
-    const add = (name, visible, trace) => { shown3d.push({ name, index: traces.length }); traces.push({ ...trace, name, visible, showlegend: false }); };
+    const add = (name, usual, trace) => { const visible = name in state.layers ? state.layers[name] : usual; shown3d.push({ name, index: traces.length }); traces.push({ ...trace, name, visible, showlegend: false }); };
     const solid = header.meshes.length + header.clouds.length > 0;
     if (header.grid) {
       const c = coarse();
@@ -134,12 +143,10 @@
     Plotly.newPlot("hidden", traces, { ...base, dragmode: "orbit", margin: { l: 0, r: 0, t: 0, b: 0 }, scene: { aspectmode: "data", dragmode: "orbit",
       xaxis: axis("x (m)"), yaxis: axis("y (m)"), zaxis: axis("z, depth (m)"),
       camera: state.camera || { eye: { x: 0.45, y: 0.4, z: -1.95 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } } }, config);
-    for (const event of ["pointerup", "wheel", "touchend", "click"])
-      at("hidden").addEventListener(event, () => setTimeout(() => { state.camera = camera(); remember(); }, 300), { passive: true });
     for (const { name, index } of shown3d) {
       const label = document.createElement("label"), box = document.createElement("input");
       box.type = "checkbox"; box.checked = traces[index].visible; box.dataset.trace = name;
-      box.addEventListener("change", () => Plotly.restyle("hidden", { visible: box.checked }, [index]));
+      box.addEventListener("change", () => { state.layers[name] = box.checked; Plotly.restyle("hidden", { visible: box.checked }, [index]); });
       label.append(box, " " + name);
       at("layers").append(label);
     }
@@ -321,7 +328,11 @@
   wall(); spot();
   at("wall").on("plotly_click", (e) => { const s = e.points[0].customdata; if (Number.isInteger(s)) choose(s); });
   at("transient").on("plotly_click", (e) => { state.bin = e.points[0].pointIndex; wall(); spot(); remember(); });
-  if (facts.profiles) { on("profile", "change", change); change(); }
+  if (facts.profiles) {
+    if ([...at("profile").options].some((o) => o.value === state.profile)) at("profile").value = state.profile;
+    on("profile", "change", () => { state.profile = at("profile").value; change(); });
+    change();
+  }
 
   if (facts.status === "running") {
     at("live").checked = state.live;
@@ -330,6 +341,9 @@
     const quiet = (Date.now() - Date.parse(facts.at)) / 60000;
     if (quiet > 10) at("message").textContent = `Nothing new for ${quiet.toFixed(0)} minutes: the run may have been stopped.`;
   }
+  window.addEventListener("pagehide", leave);
+  if (state.focus && at(state.focus)) at(state.focus).focus({ preventScroll: true });
+  window.scrollTo(0, state.scroll);
   document.body.dataset.ready = "yes";
 })().catch((error) => {
   document.getElementById("message").textContent = `This page could not be drawn: ${error.message}`;

@@ -14,17 +14,20 @@ import numpy as np
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from nlos_lit.inference.result import Accepted, Diagnosis
+from nlos_lit.effects.formulas import FORMULAS, written
+from nlos_lit.inference.result import Accepted, Diagnosis, Followed, Further
 from nlos_lit.io.files import whole_file, write_json
-from nlos_lit.report.advice import confidence, next_step
+from nlos_lit.report.advice import advised, confidence, next_step
 from nlos_lit.report.diagnosis_figures import by_evidence, diagnosis_figures
 from nlos_lit.report.glossary import glossary_list, glossed
 from nlos_lit.report.page_style import CSS
-from nlos_lit.report.quantities import NONE, amount, amount_of, number, percent, quantity
+from nlos_lit.report.quantities import NONE, amount, amount_of, headline, number, percent, quantity
 from nlos_lit.report.style import save_figure
+from nlos_lit.report.together import rows, told_apart
 from nlos_lit.report.verdict import (
     at_noise,
     barely,
+    follows,
     invisible,
     misfit,
     missing,
@@ -74,7 +77,7 @@ def write_report(
     extra_figures: Mapping[str, Figure] | None = None,
     scene: Sequence[str] = (),
 ) -> Path:
-    """Write ``report.html`` (all in one file), ``diagnosis.json`` and ``figures/*.png``.
+    """Write ``report.html`` (all in one file), ``diagnosis.json``, ``figures/*.png`` and offered effects.
 
     Args:
         diagnosis: that is shown.
@@ -99,12 +102,24 @@ def write_report(
         save_figure(figure, path)
         images[name] = _image(name, path.read_bytes())
     write_json(folder / "diagnosis.json", diagnosis.to_dict())
+    for term in diagnosis.unknown:
+        if term.formula is not None and term.formula.offered:
+            _write_effect(term.formula, diagnosis, folder / "effects")
     page = folder / "report.html"
     with whole_file(page) as partial:
         explorable = (folder / "explore.html").is_file()
-        text = report_html(diagnosis, images, list(extra), scene, explorable)
+        text = report_html(diagnosis, images, list(extra), scene, explorable, folder.parent)
         partial.write_text(text, encoding="utf-8")
     return page
+
+
+def _write_effect(formula: Followed, diagnosis: Diagnosis, folder: Path) -> None:
+    """The file of a formula that a free term follows, as an effect of its own."""
+    share, size = percent(formula.share), headline(formula.name, formula.parameters)
+    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of a free term's gain."
+    kind = next(each for each in FORMULAS if each.name == formula.name)
+    with whole_file(folder / f"{formula.name}.py") as partial:
+        partial.write_text(written(kind, found), encoding="utf-8")
 
 
 def log_figures(folder: Path | str, figures: Mapping[str, Figure]) -> None:
@@ -125,6 +140,7 @@ def report_html(
     extra: Iterable[str] = (),
     scene: Sequence[str] = (),
     explorable: bool = False,
+    folder: Path | None = None,
 ) -> str:
     """The page.
 
@@ -134,6 +150,7 @@ def report_html(
         extra: names of those that go to the end.
         scene: settings of the command line that name the scene.
         explorable: ``explore.html`` is beside it.
+        folder: of the run, for the command that takes another capture; None names none.
 
     Returns:
         HTML that needs nothing but itself.
@@ -148,7 +165,7 @@ def report_html(
     found = missing(diagnosis)
     each = "<ol>" + "".join(f"<li>{_text(one)}</li>" for one in found) + "</ol>" if len(found) > 1 else ""
     known: set[str] = set()
-    advice = next_step(diagnosis, scene)
+    advice = next_step(diagnosis, scene, folder)
     command = f"<pre tabindex=0><code>{_text(advice.command)}</code></pre>" if advice.command else ""
     link = '<p><a href="explore.html">Explore scene, wall and transients</a></p>' if explorable else ""
     parts = [
@@ -167,6 +184,7 @@ def report_html(
         if diagnosis.effects or diagnosis.unknown
         else "",
         _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
+        *(_section(f"What {_text(one.name)} says of it", _further(one)) for one in diagnosis.further),
         _section("Where simulation and measurement differ", _calm(diagnosis) + shown("residual_")),
         _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
         _section("Every known effect and free term, tested", shown("screening") + _screened(diagnosis))
@@ -301,8 +319,19 @@ def _groups(diagnosis: Diagnosis) -> str:
         splits = [t.split_by for t in terms if t.split_by]
         how = f" – split by: {'; '.join(dict.fromkeys(splits))}" if splits else ""
         names = " or ".join(f"{describe(name).phrase} ({name})" for name in group)
-        items.append(f"<li>{_text(names + how)}</li>")
+        worked_out = "".join(advised(t) for t in terms)
+        items.append(f"<li>{_text(names + how)}{_text(f'.{worked_out}' if worked_out else '')}</li>")
     return f"<p>These leave nearly the same trace in this capture.</p><ul>{''.join(items)}</ul>"
+
+
+def _further(further: Further) -> str:
+    heads = ["Was open", "Gain there over none of them (nats)", "Values", "Weight, all captures", "Verdict"]
+    text = (
+        f"{told_apart(further)} Only what was open was asked, each beside a scene of that capture's own, and"
+        " judged by parts of the wall that were not fitted. What belongs to the wall or to how the rig stands"
+        " keeps the values found before, within their errors."
+    )
+    return f"<p>{_text(text)}</p>" + _table(heads, rows(further), "cards")
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:
@@ -316,7 +345,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         "A free term is a correction without a name, of any form along its axis."
         f" The most evidence is {held}."
     )
-    return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown)
+    told = "".join(f"<p>{_text(follows(term))}</p>" for term in diagnosis.unknown)
+    return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown) + told
 
 
 def _scores(diagnosis: Diagnosis) -> str:

@@ -201,6 +201,22 @@ def _free_terms(diagnosis: Diagnosis, what: str) -> str:
     return f"{len(diagnosis.unknown)} free terms hold {what}" if several else f"A free term holds {what}"
 
 
+def follows(term: Accepted) -> str:
+    """Which formula a free term follows, in a few sentences; empty where none was asked for."""
+    formula = term.formula
+    if formula is None:
+        return ""
+    size, kept = headline(formula.name, formula.parameters), percent(max(formula.share, 0.0))
+    told = f"{describe(formula.name).phrase}, {formula.equation} ({size})"
+    if not formula.offered:
+        return f"No formula that was tried follows it; the nearest is {told}, which keeps {kept} of its gain."
+    return (
+        f"It follows {told}: this keeps {kept} of its gain on spots that were not fitted. The file"
+        f" effects/{formula.name}.py beside this page holds it as an effect; copied to nlos_lit/effects and"
+        " named in its __init__.py it is one of the registry."
+    )
+
+
 def _held(diagnosis: Diagnosis) -> float | None:
     """Share of the excess misfit that the free terms hold by themselves; None where that is not known."""
     excess = _excess(diagnosis.base)

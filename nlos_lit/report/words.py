@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.formulas import FORMULAS
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.effects.nominal import numbers_of
 from nlos_lit.effects.parameter import Number
@@ -23,6 +24,7 @@ AXES = {
 }
 PLAIN = Number("1")
 FREE_TERMS = {term.name: term for term in FREE}
+UNLISTED = FREE_TERMS | {formula.name: formula for formula in FORMULAS}
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Description:
 
 
 def describe(name: str) -> Description:
-    """Words and numbers of an effect or a free term; one that has no words is called by its name.
+    """Words and numbers of an effect, a free term or a formula; one that has no words is called by its name.
 
     Examples:
         >>> describe("irf_tail").phrase
@@ -71,6 +73,6 @@ def describe(name: str) -> Description:
         >>> describe("free_wall").phrase, describe("free_wall").free
         ('something unknown across the wall', True)
     """
-    effect = EFFECTS.named(name) or FREE_TERMS.get(name)
+    effect = EFFECTS.named(name) or UNLISTED.get(name)
     words = (effect.words if effect else None) or EffectWords(name.replace("_", " "))
     return Description(words, numbers_of(effect) if effect else {}, name in FREE_TERMS)

@@ -152,6 +152,8 @@ def check_overrides(command: str, overrides: list[str]) -> None:
         _check_override(command, override)
     run = "run" in keys and not any(text.endswith("run=null") for text in overrides)
     brought = sorted(key for key in keys if re.match(r"(scene|model)\b", key))
+    if "split_with" in keys:  # whose scene may differ
+        brought = [key for key in brought if not key.startswith("scene.")]
     if command == "diagnose" and run and brought:
         raise UserError(
             f"run=FOLDER brings its own scene and model; leave {', '.join(brought)} out, or leave run out"

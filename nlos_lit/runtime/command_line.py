@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import logging
+import os
 import re
 import sys
 import warnings
@@ -30,6 +31,8 @@ REFUSED = MappingProxyType(
 )
 
 
+OF_CAPTURES = ("train", "diagnose", "reconstruct")  # commands whose settings name a capture
+SPLIT_WITH = "--split-with"
 FILES = MappingProxyType({"inspect": "inspect_capture"})  # at the top of a checkout, where named otherwise
 
 
@@ -115,6 +118,63 @@ def given_values(arguments: list[str]) -> dict[str, str]:
     """
     pairs = (item.split("=", 1) for item in arguments if "=" in item)
     return {key: value.strip("'\"") for key, value in pairs}
+
+
+def quoted(path: Path | str) -> str:
+    """A path as a value on Hydra's command line.
+
+    Examples:
+        >>> quoted("data/a.mat"), quoted("our lab's.mat")
+        ('data/a.mat', "'our lab\\\\'s.mat'")
+    """
+    text = str(path)
+    if all(c.isalnum() or c in "/._-" for c in text) and text.isascii():
+        return text
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+def words_as_settings(command: str, arguments: list[str]) -> list[str]:
+    """What may be said without naming the setting, as settings.
+
+    The first word may be a capture file; of ``diagnose`` also the folder of a run, and ``--split-with FILE``.
+
+    Args:
+        command: as ``nlos`` names it.
+        arguments: of its command line.
+
+    Returns:
+        Arguments that Hydra reads.
+
+    Raises:
+        UserError: there is no such file, or none is named.
+
+    Examples:
+        >>> words_as_settings("train", ["scene=su"]), words_as_settings("train", [__file__])[0]
+        (['scene=su'], 'scene=capture')
+        >>> words_as_settings("diagnose", ["run=outputs/a", "--split-with", "second.hdf5"])
+        ['run=outputs/a', 'split_with=second.hdf5']
+    """
+    if command not in OF_CAPTURES:
+        return arguments
+    first, rest = arguments[:1], arguments[1:]
+    if first and not first[0].startswith(("-", "~", "+")) and "=" not in first[0]:
+        path = first[0]
+        if not os.path.exists(path):
+            raise UserError(f"{path} does not exist; give a capture file, or settings KEY=VALUE: --help")
+        is_run = command == "diagnose" and os.path.exists(os.path.join(path, "config.yaml"))
+        first = [f"run={quoted(path)}"] if is_run else ["scene=capture", f"scene.path={quoted(path)}"]
+    if command != "diagnose":
+        return first + rest
+    found, words = [], iter(first + rest)
+    for word in words:
+        flag, equals, file = word.partition("=")
+        if flag == SPLIT_WITH:
+            file = file if equals else next(words, "")
+            if not file:
+                raise UserError(f"{SPLIT_WITH} needs a capture file behind it")
+            word = f"split_with={quoted(file)}"
+        found.append(word)
+    return found
 
 
 def quote_numbers(arguments: list[str]) -> None:

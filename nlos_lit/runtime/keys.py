@@ -268,7 +268,9 @@ _scene = COMMON | _below("scene", SCENE)
 _modelled = _scene | _below("model", MODEL) | _below("surfels", SURFELS)
 KEYS: dict[str, dict[str, Rule]] = {
     "train": _modelled | _below("trainer", TRAINER) | TRAIN,
-    "diagnose": _modelled | _below("criticism", CRITICISM) | {"run": optional(FILE)},
+    "diagnose": _modelled
+    | _below("criticism", CRITICISM)
+    | {"run": optional(FILE), "split_with": optional(FILE)},
     "reconstruct": _scene | _below("method", METHOD),
     "simulate": SIMULATE,
 }

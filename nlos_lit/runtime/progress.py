@@ -72,6 +72,18 @@ class Ticker:
             self.bar.stop()
 
 
+def roughly(seconds: float) -> str:
+    """A time that is only estimated.
+
+    Examples:
+        >>> roughly(34), roughly(447), roughly(5504)
+        ('34 s', '7 min', '1.5 h')
+    """
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 class StepTicker:
     """Progress of work whose steps differ and whose length is estimated on the way.
 
@@ -100,9 +112,9 @@ class StepTicker:
         Args:
             text: what it is.
             passed: seconds since the start.
-            left: seconds that are left; 0 where that is not known.
+            left: seconds that are left of the part at hand; 0 where that is not known.
         """
-        ahead = f"about {left:.0f} s left" if left else ""
+        ahead = f"about {roughly(left)} left of this part" if left else ""
         if self.bar is not None:
             self.bar.update(
                 self.task, completed=passed, total=passed + left if left else None, note=text, left=ahead

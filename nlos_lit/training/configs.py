@@ -19,11 +19,13 @@ from omegaconf import OmegaConf
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
+from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.places import CONF
 from nlos_lit.runtime.arguments import check_values
 from nlos_lit.runtime.keys import KEYS
+from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.surfels.fit import SurfelSettings
 from nlos_lit.training.folder import plain_yaml, register_names
 from nlos_lit.training.instantiate import arguments_of
@@ -94,6 +96,30 @@ def settings_of(kind: Callable[..., T], values: Mapping[str, Any], where: str, *
         return kind(**values, **given)
     except TypeError as error:
         raise UserError(f"{where} is incomplete: {error}") from error
+
+
+def pipeline_of(
+    settings: Mapping[str, Any], scene: Mapping[str, Any], model: Mapping[str, Any]
+) -> BasePipeline:
+    """What a diagnosis fits with.
+
+    Args:
+        settings: of ``diagnose``, resolved.
+        scene: of the capture, planned.
+        model: of the image.
+
+    Returns:
+        Image and fit of the base.
+
+    Raises:
+        UserError: a section holds what there is not.
+    """
+    return BasePipeline(
+        volume=scene["volume"],
+        model=settings_of(PipelineSettings, model, "model"),
+        surfels=settings_of(SurfelSettings, settings["surfels"], "surfels"),
+        budget=parse_bytes(settings["memory_budget"]),
+    )
 
 
 def run_config(folder: str | Path) -> dict[str, Any]:

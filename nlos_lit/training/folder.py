@@ -152,10 +152,13 @@ def begun_from(folder: Path) -> Path | None:
 def begun_with(folder: Path) -> list[str]:
     """Settings of the run in a folder, as on a command line; the file may come from anywhere."""
     file = folder / OVERRIDES
+    if not file.is_file():
+        file = folder / ".hydra" / "overrides.yaml"  # a diagnosis of a capture
     altered = UserError(f"{file} was altered: it must be a list of settings such as scene.iterations=100")
     try:
-        settings = json.loads(bounded(file))
-    except (ValueError, RecursionError) as error:
+        content = bounded(file)
+        settings = json.loads(content) if file.suffix == ".json" else yaml.safe_load(content)
+    except (ValueError, RecursionError, yaml.YAMLError, FileNotFoundError) as error:
         raise altered from error
     if not isinstance(settings, list) or not all(isinstance(s, str) and SETTING.match(s) for s in settings):
         raise altered

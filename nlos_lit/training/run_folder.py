@@ -96,6 +96,7 @@ def prepare_run(
     device: torch.device | str = "cpu",
     shards: int = 1,
     opens: Mapping[Path, Sequence[str]] = NO_CHECKPOINTS,
+    raw: Capture | None = None,
 ) -> Run:
     """Everything before the first iteration: capture, volume, memory, propagated phasor field, start values.
 
@@ -105,6 +106,7 @@ def prepare_run(
         shards: processes that share the field; where there are several, it and the start values are made when
             the fit begins.
         opens: checkpoints that the run is to go on from → sections of settings that they must share.
+        raw: the scene's file, where it has been read already.
 
     Returns:
         The run, ready to fit.
@@ -115,7 +117,7 @@ def prepare_run(
     """
     began = time.perf_counter()
     scene, seed = config["scene"], int(config["seed"])
-    capture, truth = load_scene(scene, config["data_dir"], seed, config["force"])
+    capture, truth = load_scene(scene, config["data_dir"], seed, config["force"], raw)
     origin = origin_of(config, capture)
     for file, sections in opens.items():
         check_origin(file, origin, sections)

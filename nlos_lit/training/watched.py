@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.inference.criticise import Findings, Turn
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.io.files import plain
+from nlos_lit.io.views import read_view
 from nlos_lit.report.advice import confidence, next_step, told_turn
+from nlos_lit.report.together import told_apart
 from nlos_lit.report.verdict import tone, verdict
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.training.explored import Expected, Scene, facts_of, keep, view_of
@@ -61,10 +64,9 @@ class WatchedDiagnosis:
             diagnosis: what is said of them.
             given: settings of the command line that name the scene.
         """
-        said = [verdict(diagnosis), confidence(diagnosis)]
-        more = {"tone": tone(diagnosis), "profiles": plain(diagnosis.profiles), "report": True}
-        more["next"] = plain(next_step(diagnosis, given))
-        self._keep(found.base, found.final, "finished", said, **more)
+        told = told_of(diagnosis, given, self.folder)
+        more = {"profiles": plain(diagnosis.profiles), "report": True}
+        self._keep(found.base, found.final, "finished", told.pop("said"), **told, **more)
 
     def _keep(self, base: SurfelFit, present: SurfelFit, status: str, said: list[str], **more: Any) -> None:
         models, clouds = {"rendered": _expected(base)}, {"surfels": base.model.points()}
@@ -75,6 +77,37 @@ class WatchedDiagnosis:
         volume = None if self.image is None else (self.image[0].cpu().numpy(), self.image[1])
         facts = facts_of(self.scene, self.capture, status, said, **more)
         keep(self.folder, view_of(self.capture, models, Scene(clouds, volume=volume), facts))
+
+
+def told_of(diagnosis: Diagnosis, given: Sequence[str], folder: Path) -> dict[str, Any]:
+    """What a page says of a diagnosis, as entries of its facts.
+
+    Args:
+        diagnosis: the whole.
+        given: settings of the command line that name the scene.
+        folder: of the diagnosis.
+
+    Returns:
+        Sentences, tone, and what to do next.
+    """
+    said = [verdict(diagnosis), confidence(diagnosis), *map(told_apart, diagnosis.further)]
+    return {
+        "said": said,
+        "tone": tone(diagnosis),
+        "next": plain(next_step(diagnosis, given, folder.parent)),
+    }
+
+
+def retell(folder: Path, diagnosis: Diagnosis, given: Sequence[str]) -> None:
+    """Let the page of a finished diagnosis say what is known now.
+
+    Args:
+        folder: of the diagnosis.
+        diagnosis: as it is now.
+        given: settings of the command line that name the scene.
+    """
+    view = read_view(folder)
+    keep(folder, dataclasses.replace(view, facts=view.facts | told_of(diagnosis, given, folder)))
 
 
 def _expected(fit: SurfelFit) -> Expected:

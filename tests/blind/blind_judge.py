@@ -35,6 +35,7 @@ class Outcome:
     Args:
         named: accepted effects in order, first their groups.
         unexplained: the axis of the accepted free term with the most evidence, or "".
+        formulas: that accepted free terms follow closely enough.
         statistic: 2 × the oracle's gain on spots that no fit saw, scaled to the number of fitted spots;
             statistic_error: its standard error, by bootstrap over wall blocks.
         gain, oracle: nats on the select spots, over the base.
@@ -58,6 +59,7 @@ class Outcome:
     found: dict[str, dict[str, tuple[float, float]]] = field(default_factory=dict)
     screened: list[tuple[str, float, float]] = field(default_factory=list)
     ratio: float = 1.0
+    formulas: list[str] = field(default_factory=list)
     seconds: float = 0.0
 
     def to_dict(self) -> dict:
@@ -123,6 +125,7 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
         found={e.name: {n: (p.value, p.stderr) for n, p in e.parameters.items()} for e in diagnosis.effects},
         screened=[(c.name, c.evidence, c.retained_information) for c in diagnosis.screened[:6]],
         ratio=diagnosis.base.deviance_per_bin / diagnosis.base.deviance_noise,
+        formulas=[u.formula.name for u in diagnosis.unknown if u.formula and u.formula.offered],
         seconds=diagnosis.seconds,
     )
 

@@ -81,7 +81,9 @@ def test_a_detector_that_saturates_is_not_called_a_dark_wall():
 
     A smooth map over the wall explains it, but the map follows the count rate.
     """
-    check(run_case(Spec("default", ("saturation",), (3,), 1500, 4108), QUICK, oracle=False))
+    outcome = run_case(Spec("default", ("saturation",), (3,), 1500, 4108), QUICK, oracle=False)
+    check(outcome)
+    assert outcome.formulas == ["counts_over_rate_log"]  # it is 1/(1 + n/n0)
 
 
 @pytest.mark.slow

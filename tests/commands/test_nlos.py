@@ -33,6 +33,22 @@ def test_a_misspelt_command_is_answered_with_the_nearest(capsys, monkeypatch):
         assert "nlos look FILE" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (["look", "nowhere.mat"], "a capture file"),
+        (["inspect", "nowhere.mat"], "a capture file"),
+        (["view", "nowhere.mat"], "a folder that a run has named"),
+        (["compare", ".", "nowhere.mat"], "a folder that a run has named"),
+    ],
+)
+def test_a_missing_file_is_said_before_anything_is_loaded(words, wanted, capsys, monkeypatch):
+    monkeypatch.delenv(STARTED, raising=False)
+    monkeypatch.setattr(nlos.importlib, "import_module", lambda name: pytest.fail("a module was loaded"))
+    assert main(words) == 2
+    assert f"error: nowhere.mat does not exist; give {wanted}" in capsys.readouterr().err
+
+
 def test_processes_that_help_with_a_run_open_its_command(monkeypatch):
     opened = []
     monkeypatch.setattr(nlos, "open_command", lambda name, words: opened.append((name, words)) or 0)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,9 +18,12 @@ from inference_scenes import capture_of, raster
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from data_modules.readers import write_capture
+from nlos_lit.commands.simulate import simulate
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Gain, Tried
+from nlos_lit.io.files import write_json
 from nlos_lit.io.views import read_view
 
 SCENE = [
@@ -86,7 +90,7 @@ def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     said = json.loads((finished / "diagnosis" / "diagnosis.json").read_text())
     assert set(said) == {
         "effects", "unknown", "groups", "unexplained", "screened", "base", "extended", "untouched_test",
-        "witness", "profiles", "needed", "chance", "notes", "capture", "toys", "seconds", "seed",
+        "witness", "profiles", "needed", "chance", "notes", "capture", "toys", "seconds", "seed", "further",
     }  # fmt: skip
     assert {s["name"] for s in said["screened"]} == {e.name for e in [*EFFECTS, *FREE]}
     for one in said["screened"]:
@@ -125,6 +129,50 @@ def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     for name in FIGURES:
         assert (finished / "diagnosis" / "figures" / f"{name}.png").stat().st_size > 5000
     assert (finished / "config.yaml").exists()
+
+
+def test_a_second_capture_is_asked_what_stays(finished, tmp_path):
+    """The first diagnosis left two names open, of which its own blocks cannot tell."""
+    first, second = tmp_path / "first", tmp_path / "second scan.hdf5"
+    shutil.copytree(finished, first)
+    file = first / "diagnosis" / "diagnosis.json"
+    even = {name: Tried([0.5] * 16) for name in ("background_slope", "direct_leak")}
+    term = Accepted(
+        "background_slope", {"slope": Estimate(0.3, 0.1, "1")}, 30.0, Gain(1.1, 1.0, 0.01, (0.005, 0.02)),
+        dict.fromkeys(even, 0.5), "a look", tried=even,
+    )  # fmt: skip
+    opened = dataclasses.replace(Diagnosis.read(file), effects=[term], groups=[list(even)])
+    write_json(file, opened.to_dict())
+    simulate(
+        [
+            f"out={second}",
+            "nx=24",
+            "ny=24",
+            "seed=5",
+            "effects=[background_slope]",
+            "background_slope.slope=0.8",
+        ]
+    )
+    words = [sys.executable, "diagnose.py", str(first), "--split-with", str(second), *SMALL]
+    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
+    said = Diagnosis.read(file)
+    (further,) = said.further
+    assert (further.name, further.asked, further.held) == ("second_scan", list(even), [])
+    assert further.nats["background_slope"] > further.nats["direct_leak"]
+    assert further.stays[0] == "background_slope"
+    assert len(said.effects[0].tried["background_slope"].nats) == 32
+    page = (first / "diagnosis" / "report.html").read_text(encoding="utf-8")
+    assert "What second_scan says of it" in page
+    facts = read_view(first / "diagnosis").facts
+    assert facts["status"] == "finished"
+    assert any("second_scan" in sentence for sentence in facts["said"])
+    assert "scene.simulate.scan.nx=24" in facts["next"]["command"]
+    again = subprocess.run(
+        [*words[:3], "--split-with", str(tmp_path / "no.mat")], cwd=ROOT, capture_output=True, text=True
+    )
+    assert again.returncode == 2
+    assert "split_with must be a file or folder that is there" in again.stderr
 
 
 def test_figures_are_in_tensorboard(finished):

@@ -113,7 +113,7 @@ def test_an_error_is_one_sentence_and_status_2(tmp_path):
     )
     assert run.returncode == 2
     assert run.stdout == ""
-    assert run.stderr == f"there is no file {tmp_path / 'nothing.mat'}\n"
+    assert run.stderr == f"error: {tmp_path / 'nothing.mat'} does not exist; give a capture file\n"
 
 
 def test_the_help_names_every_format(capsys):

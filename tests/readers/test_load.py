@@ -11,7 +11,9 @@ import pytest
 from conftest import real_file
 from small_capture import fields
 
-from data_modules import load
+import nlos_lit
+from data_modules import load, plan
+from data_modules.examine import examine
 from data_modules.load import find_file, load_scene
 from data_modules.readers import write_capture
 from nlos_lit.capture import Capture
@@ -63,6 +65,33 @@ def test_a_file_in_the_data_folder_is_found(tmp_path):
         UserError, match=r"needs data_diffuse_s.mat.*comes from the supplement of O'Toole.*scene.path=FILE"
     ):
         find_file(scene("diffuse_s"), tmp_path)
+
+
+def test_a_file_is_read_once(tmp_path, monkeypatch):
+    """Also where its data are planned for, and from Python."""
+    capture, _ = load_scene(scene("default", *SMALL), tmp_path, seed=0)
+    write_capture(tmp_path / "x.hdf5", capture)
+    read = []
+    own = load.read_capture
+    monkeypatch.setattr(load, "read_capture", lambda *given, **more: read.append(1) or own(*given, **more))
+    load_scene(scene("capture", f"scene.path={tmp_path}/x.hdf5"), tmp_path, seed=0)
+    assert len(read) == 1
+    measured = nlos_lit.load(tmp_path / "x.hdf5")
+    measured.reconstruct("lct")
+    measured.reconstruct("phasor", "scene.volume.depth=[0.4,0.9]")
+    assert len(read) == 1, "what was read to look at it is what is reconstructed"
+    measured.reconstruct("lct", "scene.reader.flip_x=true")
+    assert len(read) == 2
+
+
+def test_first_returns_are_worked_out_once(tmp_path, monkeypatch):
+    capture, _ = load_scene(scene("default", *SMALL), tmp_path, seed=0)
+    worked = []
+    own = plan._returns
+    monkeypatch.setattr(plan, "_returns", lambda of: worked.append(of) or own(of))
+    examine(capture)
+    plan.returns(capture)
+    assert [of is capture for of in worked] == [True, False], "of the capture, and of its summed bins"
 
 
 LOST = "the capture's largest value is .*what is computed of values"

@@ -206,6 +206,22 @@ def test_links_out_of_the_file_are_not_followed(tmp_path):
     assert _outcome(tmp_path / "b.hdf5") == "refused"
 
 
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b"\x89PNG\r\n\x1a\n" + bytes(64), "a PNG picture"),
+        (b"\xff\xd8\xff\xe0" + bytes(64), "a JPEG picture"),
+        (b"x,y,counts\n1,2,3\n", "a text file"),
+        (b"\x93NUMPY\x01\x00", "a NumPy array without geometry"),
+        (bytes(range(1, 60)), "neither HDF5, MATLAB nor Radiance HDR: it begins with"),
+    ],
+)
+def test_what_is_no_capture_at_all_is_called_by_its_name(content, kind, tmp_path):
+    (tmp_path / "other").write_bytes(content)
+    with pytest.raises(CaptureError, match=f"other is {kind}.*; a capture is an HDF5, MATLAB or Radiance"):
+        read_capture(tmp_path / "other")
+
+
 def test_a_video_is_told_from_a_capture(tmp_path):
     (tmp_path / "video.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(64))
     with pytest.raises(CaptureError, match="video"):

@@ -9,10 +9,11 @@ import pytest
 from matplotlib.colors import to_hex
 from report_cases import CASES, TAIL, TAIL_ALONE, TILT, UNKNOWN, diagnosis, free, profiles, two_found
 
-from nlos_lit.inference.result import Gain, Scores
+from nlos_lit.inference.advise import AGAIN
+from nlos_lit.inference.result import Diagnosis, Estimate, Followed, Gain, Scores
 from nlos_lit.report import diagnosis_figures as plots
 from nlos_lit.report.advice import TELLS, confidence, next_step
-from nlos_lit.report.page import report_html
+from nlos_lit.report.page import report_html, write_report
 from nlos_lit.report.style import RED
 from nlos_lit.report.words import AXES
 
@@ -94,3 +95,48 @@ def test_nothing_is_red_where_nothing_was_found():
     (mesh,) = [c for a in shown["residual_wall"].axes for c in a.collections if hasattr(c, "norm")][:1]
     assert mesh.norm.vmax > 1.9 * np.nanmax(np.abs(strong()[-1].before))  # half of the colour at most
     assert 'class="unexplained"' not in report_html(calm, {})
+
+
+def following(share: float, offered: bool) -> Diagnosis:
+    """A free term along the scan that comes so near to a step."""
+    numbers = {"height": Estimate(-0.117, 0.004, "1"), "place": Estimate(0.412, 0.003, "1")}
+    formula = Followed("counts_over_scan_step", "height σ((x - place)/0.01)", numbers, share, offered)
+    term = dataclasses.replace(UNKNOWN["free_scan"], formula=formula)
+    return dataclasses.replace(CASES["unexplained"], unknown=[term])
+
+
+def test_a_formula_that_a_free_term_follows_is_told_and_left_as_a_file(tmp_path):
+    page = write_report(following(0.97, True), tmp_path)
+    text, file = page.read_text(), tmp_path / "effects" / "counts_over_scan_step.py"
+    said = "It follows a step over the course of the scan"
+    assert said in text
+    assert said in next_step(following(0.97, True)).text
+    assert "97 % of its gain" in text
+    assert "class CountsOverScanStep(Step, CountsOverScan)" in file.read_text()
+    assert "97 % of a free term" in file.read_text()
+
+
+def test_a_formula_that_keeps_too_little_is_told_and_not_offered(tmp_path):
+    text = write_report(following(0.42, False), tmp_path).read_text()
+    assert "No formula that was tried follows it; the nearest is a step" in text
+    assert "which keeps 42 % of its gain" in text
+    assert not (tmp_path / "effects").exists()
+    assert "follows" not in next_step(following(0.42, False)).text
+
+
+@pytest.mark.parametrize(
+    ("order", "said"),
+    [
+        (39.0, "By calculation the same scan again would tell as much as others: 20 nats."),
+        (140.0, "By calculation a second scan in another order would tell 140 nats, the same scan again 20."),
+    ],
+)
+def test_what_another_capture_would_tell_is_said_where_names_are_open(order, said):
+    """From twice as much on."""
+    told = {AGAIN: 20.0, "a second scan in another order": order, "a capture with the laser off": 1.0}
+    open_ = two_found(
+        effects=[dataclasses.replace(TAIL, advised=told)], groups=[["irf_tail", "afterpulsing"]]
+    )
+    assert said in next_step(open_).text
+    assert said in report_html(open_, {})
+    assert "By calculation" not in next_step(two_found(effects=[TAIL], groups=[])).text

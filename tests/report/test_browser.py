@@ -219,3 +219,32 @@ def test_reading_aids(browser, page, folder, tmp_path):
         assert one.evaluate("document.documentElement.scrollWidth <= innerWidth")
     phone.close()
     opened.close()
+
+
+def test_a_reload_keeps_what_the_reader_looks_at(browser, tmp_path):
+    """As the page does by itself every ten seconds while a run goes on."""
+    write_page(tmp_path, view(status="running", profiles=plain(profiles(9.0))))
+    opened, wrong = shown(browser, tmp_path / "explore.html", PHONE)
+    opened.get_by_role("button", name="From the side").click()
+    opened.get_by_role("button", name="Turn to the right").click()
+    opened.get_by_label("mesh", exact=True).check()
+    opened.select_option("#what", label=f"residual, {RENDERED}")
+    opened.select_option("#profile", "time")
+    opened.uncheck("#all")
+    set_range(opened, "#time", 20)
+    opened.fill("#spot", "8")
+    opened.press("#spot", "Enter")
+    opened.evaluate("window.scrollTo(0, 900)")
+    turned = eye(opened)
+    opened.reload()
+    opened.wait_for_selector(READY, timeout=60_000)
+    np.testing.assert_allclose(eye(opened), turned, atol=1e-6)
+    assert opened.get_by_label("mesh", exact=True).is_checked()
+    assert [opened.input_value(f"#{name}") for name in ("what", "profile", "time", "spot")] == [
+        "residual:0", "time", "20", "8",
+    ]  # fmt: skip
+    assert not opened.is_checked("#all")
+    assert opened.evaluate("scrollY") == 900
+    assert opened.evaluate("document.activeElement.id") == "spot"
+    assert wrong == []
+    opened.close()

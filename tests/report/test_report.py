@@ -130,8 +130,10 @@ def test_json_is_the_diagnosis(written, case):
             "heldout_gain",
             "weights",
             "split_by",
+            "advised",
             "axis",
             "shape",
+            "formula",
             "needed",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())

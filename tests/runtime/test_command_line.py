@@ -1,9 +1,11 @@
-"""How a command ends where it cannot go on."""
+"""Words that name no setting, and how a command ends where it cannot go on."""
 
 import pytest
 
 from nlos_lit.capture.errors import UserError
-from nlos_lit.runtime.command_line import sentence_errors
+from nlos_lit.runtime.arguments import check_overrides
+from nlos_lit.runtime.command_line import sentence_errors, words_as_settings
+from nlos_lit.training.configs import compose
 
 
 @pytest.mark.parametrize(
@@ -31,3 +33,24 @@ def test_a_mistake_of_ours_keeps_its_traceback():
 
     with pytest.raises(ZeroDivisionError):
         command()
+
+
+def test_a_file_is_taken_as_it_is(tmp_path):
+    file, run = tmp_path / "our lab's.mat", tmp_path / "run"
+    file.touch()
+    run.mkdir()
+    (run / "config.yaml").touch()
+    (own,) = words_as_settings("train", [str(file)])[1:]
+    check_overrides("train", ["scene=capture", own, "seed=1"])
+    assert compose("train", ["scene=capture", own])["scene"]["path"] == str(file)
+    assert words_as_settings("diagnose", [str(run)]) == [f"run={run}"]
+    split = words_as_settings(
+        "diagnose", [str(run), f"--split-with={run}", "scene.reader.scan_order=columns"]
+    )
+    assert split == [f"run={run}", f"split_with={run}", "scene.reader.scan_order=columns"]
+    check_overrides("diagnose", split)
+    assert words_as_settings("simulate", ["mine.mat"]) == ["mine.mat"]
+    with pytest.raises(UserError, match=r"nowhere.mat does not exist; give a capture file, or settings"):
+        words_as_settings("train", ["nowhere.mat"])
+    with pytest.raises(UserError, match="--split-with needs a capture file behind it"):
+        words_as_settings("diagnose", [str(run), "--split-with"])

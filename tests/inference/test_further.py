@@ -1,0 +1,52 @@
+"""What a diagnosis keeps for further captures, and reads again."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+from report_cases import CASES, TAIL
+
+from nlos_lit.capture.errors import UserError
+from nlos_lit.inference.further import open_terms
+from nlos_lit.inference.result import Diagnosis, Further, Tried
+from nlos_lit.io.files import write_json
+
+TRIED = {"irf_tail": Tried([3.0, -1.0]), "afterpulsing": Tried([2.0, 0.5], {"decay": [0.1]})}
+AGAIN = Further(
+    "scan_2", list(TRIED), {"irf_tail": 4.0, "afterpulsing": 9.0}, [], True,
+    {"irf_tail": 0.2, "afterpulsing": 0.8}, ["irf_tail", "afterpulsing"],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_diagnosis_is_read_as_it_was_written(name, tmp_path):
+    kept = dataclasses.replace(CASES[name], effects=[dataclasses.replace(TAIL, tried=TRIED)], further=[AGAIN])
+    write_json(tmp_path / "diagnosis.json", kept.to_dict())
+    back = Diagnosis.read(tmp_path / "diagnosis.json")
+    assert back.to_dict() == kept.to_dict()
+    assert back.effects[0] == kept.effects[0]
+    assert back.further == [AGAIN]
+    assert [type(p.before) for p in back.profiles] == [type(p.before) for p in kept.profiles]
+    assert math.isnan(back.chance) == (not math.isfinite(kept.chance))
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[1]", '{"effects": 3}', "{" * 9999])
+def test_what_is_no_diagnosis_is_one_sentence(text, tmp_path):
+    (tmp_path / "diagnosis.json").write_text(text)
+    with pytest.raises(UserError, match=r"diagnosis.json holds no diagnosis of this version"):
+        Diagnosis.read(tmp_path / "diagnosis.json")
+
+
+def test_a_further_capture_needs_something_that_is_open():
+    known = dataclasses.replace(TAIL, tried=TRIED)
+    whole = dataclasses.replace(CASES["both"], effects=[known])
+    assert open_terms(whole) == [known]
+    alone = dataclasses.replace(known, weights={"irf_tail": 1.0})
+    with pytest.raises(UserError, match=r"leaves no two names open.*it names irf_tail alone"):
+        open_terms(dataclasses.replace(whole, effects=[alone]))
+    with pytest.raises(UserError, match="it names no effect"):
+        open_terms(dataclasses.replace(whole, effects=[]))
+    with pytest.raises(UserError, match="of an earlier version"):
+        open_terms(dataclasses.replace(whole, effects=[TAIL]))
