@@ -63,6 +63,9 @@ def list_mat5(path: Path, most: int) -> dict[str, tuple[tuple[int, ...], bool]]:
         path: of the file.
         most: arrays that it may hold.
 
+    Returns:
+        name → shape, numeric.
+
     Raises:
         CaptureError: it holds more, or packed structs of a size that would take long to list.
         ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).

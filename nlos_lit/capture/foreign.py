@@ -19,6 +19,9 @@ def bounded(file: Path, most: int = TEXT) -> bytes:
         file: to read.
         most: bytes.
 
+    Returns:
+        all of its bytes.
+
     Raises:
         OSError: it is not there, or cannot be read.
         UserError: it is a pipe or a device, or larger.

@@ -241,7 +241,15 @@ def check_config(command: str, config: DictConfig) -> None:
 
 
 def check_values(command: str, config: Mapping[str, Any]) -> None:
-    """As :func:`check_config`, of plain containers; sections may be missing, what is there is checked."""
+    """As :func:`check_config`, of plain containers.
+
+    Args:
+        command: as there.
+        config: sections may be missing; what is there is checked.
+
+    Raises:
+        UserError: as there.
+    """
     rules = KEYS[command]
     for key, value in _leaves(rules, config):
         if any(f"{key}.".startswith(f"{section}.") for section in FOREIGN_SECTIONS):
