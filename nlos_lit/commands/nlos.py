@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import nlos_lit
-
-STARTED = "NLOS_COMMAND"  # in the environment: what further processes of a run are to be
+from nlos_lit.places import STARTED
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,6 @@ class Effect(nn.Module, Hooks):
         # Per-spot effects: of their distribution, and how many spots have it.
         self.width, self.share = 0.0, 1.0
         self.prior_scale = 1.0  # of all prior deviations
-        self.known: dict[str, tuple[Tensor, Tensor]] = {}  # stored values and their errors, of other captures
         self.reset()
 
     @classmethod
@@ -147,33 +146,14 @@ class Effect(nn.Module, Hooks):
         parts = [self._precision(p) if p.prior else torch.zeros(p.size) for p in self.declared.values()]
         return torch.cat(parts) if parts else torch.zeros(0)
 
-    def begin_at(self, name: str, value: Tensor, error: Tensor) -> None:
-        """Begin at values that another capture gave, and stay there within their errors.
-
-        Args:
-            name: of the parameter.
-            value: ``[size]``, in the parameter's unit.
-            error: ``[size]``, likewise.
-        """
-        self.set(name, value)
-        stored = getattr(self, f"raw_{name}").detach().clone()
-        self.known[name] = stored, error / self.declared[name].scale
-
     def penalty(self) -> Tensor:
-        """Nats that the prior takes for the present values, and what is known of other captures.
-
-        ``½ Σ (value/deviation)²``, 0 at the null, and ``½ Σ ((value - known)/error)²``.
-        """
+        """Nats that the prior takes for the present values: ``½ Σ (value/deviation)²``; 0 at the null."""
         total = torch.zeros(())
         for p in self.declared.values():
             if p.prior:
                 raw = getattr(self, f"raw_{p.name}")
                 off = raw - (p.null or 0.0) / p.scale
                 total = total.to(raw.device) + 0.5 * (self._precision(p).to(raw.device) * off.square()).sum()
-        for name, (stored, error) in self.known.items():
-            raw = getattr(self, f"raw_{name}")
-            off = (raw - stored.to(raw.device)) / error.to(raw.device)
-            total = total.to(raw.device) + 0.5 * off.square().sum()
         return total
 
     def _precision(self, p: Parameter) -> Tensor:

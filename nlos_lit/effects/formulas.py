@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from typing import ClassVar
 
 import torch
@@ -60,7 +61,15 @@ class Form:
 
     @staticmethod
     def functions(x: Tensor, shape: Tensor) -> Tensor:
-        """``[…, J]`` values of b_j at ``x`` ``[…]``; ``shape`` is a scalar."""
+        """Values of b_j.
+
+        Args:
+            x: ``[…]``.
+            shape: a scalar, of the scanned parameter.
+
+        Returns:
+            ``[…, J]``.
+        """
         raise NotImplementedError
 
 
@@ -157,31 +166,29 @@ class Formula(Form, Effect):
 
     Attributes:
         free: the free term whose place it is.
-        where: the axis in words. acts: the equation of the place, in terms of f.
-        size: unit, noticeable change and bound of the amplitudes, bins for a delay.
+        where: the axis in words. acts: the equation of the place, in terms of f. is_x: what x is.
+        size: unit, noticeable change and bound of the amplitudes, bins for a delay. one_way: they cannot be
+            negative.
     """
 
     free: ClassVar[type[Free]]
     where: ClassVar[str]
     acts: ClassVar[str]
+    is_x: ClassVar[str]
     size: ClassVar[tuple[str, float, float]] = ("1", 0.05, 3.0)
     kind: ClassVar[str] = "plain"
+    one_way: ClassVar[bool] = False
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         unit, scale, bound = cls.size
         unit_size = scan.bin_length if unit == "m" else 1.0
-        low = 0.0 if cls.one_way() else -bound * unit_size
+        low = 0.0 if cls.one_way else -bound * unit_size
         amplitudes = [
             Parameter(name, unit, 0.0, scale * unit_size, low, bound * unit_size, kind=cls.kind)
             for name in cls.names
         ]
         return (*amplitudes, *cls.shape())
-
-    @classmethod
-    def one_way(cls) -> bool:
-        """Amplitudes cannot be negative."""
-        return False
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -209,11 +216,23 @@ class Formula(Form, Effect):
         """
         raise NotImplementedError
 
+    def along(self, edges: Tensor) -> Tensor | None:
+        """Where places of the axis are.
+
+        Args:
+            edges: ``[…]`` as :class:`~nlos_lit.inference.result.Shape` has them.
+
+        Returns:
+            ``[…]`` x; None where f is not what the free term's shape shows.
+        """
+        raise NotImplementedError
+
     def quantities(self) -> dict[str, Quantity]:
         return {p.name: Quantity(self.value(p.name), p.unit, kind=p.kind) for p in self.declared.values()}
 
 
 class _OverScan(Formula):
+    is_x: ClassVar[str] = "the order of acquisition from 0 to 1"
     order: Tensor
 
     def __init__(self, scan: Scan) -> None:
@@ -226,6 +245,9 @@ class _OverScan(Formula):
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.order[spots], free.values()[spots], torch.ones(len(spots))
+
+    def along(self, edges: Tensor) -> Tensor | None:
+        return edges / len(self.order)
 
 
 class CountsOverScan(_OverScan):
@@ -264,15 +286,15 @@ class WidthOverScan(_OverScan):
     free, where = FreeResponseScan, "in the response's width over the course of the scan"
     acts = "signal → signal * N(0, f bins²)"
     size: ClassVar[tuple[str, float, float]] = ("1", 1.0, 100.0)
-
-    @classmethod
-    def one_way(cls) -> bool:
-        return True
+    one_way: ClassVar[bool] = True
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Its first kernel spreads light by a bin to either side: a variance of twice its coefficient.
         assert isinstance(free, FreeResponseScan)
         return self.order[spots], 2 * free.weights()[:, 0][spots], torch.ones(len(spots))
+
+    def along(self, edges: Tensor) -> None:
+        return None
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         length = 2 * signal.shape[1]
@@ -284,12 +306,16 @@ class WidthOverScan(_OverScan):
 class CountsOverTime(Formula):
     """All spots count too much or too little in the same bins."""
 
-    free, where, acts = FreeTime, "along the time axis", "m_t → m_t e^f, x from the gate's start to its end"
+    free, where, acts = FreeTime, "along the time axis", "m_t → m_t e^f"
+    is_x = "the time from 0 in the gate's first bin to 1 in its last"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        first, last = self.scan.gate
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
-        return expected * torch.exp(self.f(((bins - first) / (last - 1 - first)).clamp_min(0.0)))
+        return expected * torch.exp(self.f(self.along(bins)))
+
+    def along(self, edges: Tensor) -> Tensor:
+        first, last = self.scan.gate
+        return ((edges - first) / (last - 1 - first)).clamp_min(0.0)
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         first, last = self.scan.gate
@@ -299,12 +325,14 @@ class CountsOverTime(Formula):
 class CountsOverRate(Formula):
     """Spots with many counts have too few, or too many."""
 
-    free, where = FreeRate, "with the count rate"
-    acts = "m → m e^f, x the spot's counts over e² times the scan's mean"
+    free, where, acts = FreeRate, "with the count rate", "m → m e^f"
+    is_x = "a spot's counts over e² times the scan's mean"
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        most = self.scan.mean_counts * math.exp(RATES[1])
-        return expected * torch.exp(self.f(expected.sum(1, keepdim=True) / most))
+        return expected * torch.exp(self.f(self.along(expected.sum(1, keepdim=True))))
+
+    def along(self, edges: Tensor) -> Tensor:
+        return edges / (self.scan.mean_counts * math.exp(RATES[1]))
 
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Knots are evenly spaced along ln n; each has the spots about it.
@@ -345,7 +373,7 @@ def _words(form: type[Form], place: type[Formula]) -> EffectWords:
 
 
 FORMULAS: tuple[type[Formula], ...] = tuple(
-    _pair(form, place) for place in PLACES for form in FORMS if form.form in ONE_SIGN or not place.one_way()
+    _pair(form, place) for place in PLACES for form in FORMS if form.form in ONE_SIGN or not place.one_way
 )
 
 
@@ -377,16 +405,26 @@ def written(formula: type[Formula], found: str) -> str:
     Returns:
         Python source; its module's name is the formula's.
     """
-    found = re.sub(r"[^\w .,;:%±·()-]", "", found)
     form, place = formula.__mro__[1:3]
     assert issubclass(form, Form)
     assert issubclass(place, Formula)
     words, title = formula.words, "".join(part.capitalize() for part in formula.name.split("_"))
     assert words is not None
-    unit = place.size[0]
     amplitudes = ", ".join(f"``{name}``" for name in form.names)
-    told = f" {form.told}" if form.told else ""
     phrase = words.phrase[0].upper() + words.phrase[1:]
+    clean = re.sub(r"[^-\u2212±·%().,:;\w ]", "", found)
+    paragraphs = [
+        f"{phrase}.",
+        f"``{place.acts}``, ``f = {form.equation}``, x {place.is_x}.",
+        f"Parameters: {amplitudes} ({place.size[0]}), null 0. {form.told}",
+        f"Signature: the residual follows this form {place.where}.",
+        "Degenerate with: any effect that changes the same along the same axis.",
+        f"Source: {clean}",
+    ]
+    lines = [
+        textwrap.fill(p.strip(), 106, initial_indent=4 * " ", subsequent_indent=4 * " ") for p in paragraphs
+    ]
+    docstring = "\n\n".join(lines).lstrip()
     return f'''"""{phrase}."""
 
 from __future__ import annotations
@@ -396,17 +434,7 @@ from nlos_lit.effects.words import EffectWords
 
 
 class {title}({form.__name__}, {place.__name__}):
-    """{phrase}.
-
-    ``{place.acts}``, ``f = {form.equation}``, x along the axis from 0 to 1.
-
-    Parameters: {amplitudes} ({unit}), null 0.{told}
-
-    Signature: the residual follows this form {place.where}.
-
-    Degenerate with: any effect that changes the same along the same axis.
-
-    Source: {found}
+    """{docstring}
     """
 
     name = "{formula.name}"

@@ -80,7 +80,8 @@ def assemble(
         return Uncertainty(fit, torch.from_numpy(spots), fit.counts[rows], block, share)
 
     uncertainty = uncertainty_of(final)
-    followed = {name: _followed(f, uncertainty_of(f.fit)) for name, f in followers.items()}
+    terms = {e.name: e for e in final.extension.effects if isinstance(e, Free)}
+    followed = {n: _followed(f, terms[n], uncertainty_of(f.fit), scan) for n, f in followers.items()}
     accepted = [_accepted(turn, found, uncertainty, split, scan, followed) for turn in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
@@ -113,11 +114,35 @@ def assemble(
     )
 
 
-def _followed(follower: Follower, uncertainty: Uncertainty) -> Followed:
+def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Scan) -> Followed:
     formula = next(e for e in follower.fit.extension.effects if e.name == follower.name)
     assert isinstance(formula, Formula)
-    parameters = uncertainty.parameters(formula, None)
-    return Followed(follower.name, formula.equation, parameters, follower.share, follower.offered)
+    parameters, shape = uncertainty.parameters(formula, None), shape_of(free, scan)
+    curve = laid_through(formula, free, follower.fit, torch.from_numpy(shape.edges).float())
+    equation = f"{formula.equation}, x {formula.is_x}"
+    told = (follower.name, equation, parameters, follower.share, follower.offered)
+    return Followed(*told, curve)
+
+
+@torch.no_grad()
+def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray | None:
+    """A formula at places of an axis, as high as the free term that it follows.
+
+    Args:
+        formula: of ``fit``.
+        free: the term.
+        fit: with the formula.
+        edges: ``[K]`` of the axis.
+
+    Returns:
+        ``[K]``; None where the term shows something else.
+    """
+    x = formula.along(edges)
+    if x is None:
+        return None
+    at, values, weight = formula.seen_in(free, fit.train, fit.model.expected(fit.train, fit.extension))
+    constant = (weight * (values - formula.f(at))).sum() / weight.sum()
+    return (formula.f(x) + constant).numpy()
 
 
 def _accepted(
@@ -167,32 +192,26 @@ def _advised(name: str, names: list[str], trials: list[Trial]) -> dict[str, floa
 def _tried(name: str, trials: list[Trial], split: Split) -> Tried:
     trial = next(t for t in trials if t.name == name)
     none = next(t for t in trials if t.candidate is None)
-    assert trial.candidate is not None
-    return tried_with(trial.candidate, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
+    return tried_with(name, trial.fit, nats_by_block(none.likelihood, trial.likelihood, split))
 
 
-def tried_with(candidate: Candidate, fit: SurfelFit, nats: list[float]) -> Tried:
+def tried_with(name: str, fit: SurfelFit, nats: list[float]) -> Tried:
     """What is kept of a term that was tried.
 
     Args:
-        candidate: as the pool saw it.
+        name: of the term.
         fit: that went on with it.
         nats: of each wall block.
 
     Returns:
         The record; with values where another capture of the same wall has them alike.
     """
-    effect = next(e for e in fit.extension.effects if e.name == candidate.name)
+    effect = next(e for e in fit.extension.effects if e.name == name)
     if not effect.lasting:
         return Tried(nats)
-    sizes = [p.size for p in effect.amplitudes]
-    errors = [
-        (p.scale * part.float()).tolist()
-        for p, part in zip(effect.amplitudes, candidate.error.split(sizes), strict=True)
-    ]
-    names = [p.name for p in effect.amplitudes]
-    values = {name: effect.value(name).detach().reshape(-1).tolist() for name in names}
-    return Tried(nats, values, dict(zip(names, errors, strict=True)))
+    return Tried(
+        nats, {p.name: effect.value(p.name).detach().reshape(-1).tolist() for p in effect.amplitudes}
+    )
 
 
 def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
@@ -312,6 +331,15 @@ def _means(values: Tensor, band: Tensor, number: int) -> np.ndarray:
 
 
 def facts_of(capture: Capture, name: str) -> dict[str, Any]:
+    """What a diagnosis says of its capture.
+
+    Args:
+        capture: that was diagnosed.
+        name: of it.
+
+    Returns:
+        JSON-serialisable; ``wall`` is the scanned part, ``[x0, x1, y0, y1]``, m.
+    """
     first, last = capture.gate
     order = capture.scan_order
     points = capture.sensor if np.ptp(capture.sensor, axis=0).max() > 0 else capture.laser

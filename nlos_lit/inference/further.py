@@ -2,8 +2,8 @@
 
 Each capture has a scene of its own, and only the names that are open are tried. What each gains over none of
 them, on wall blocks that were not fitted, is added to what it gained on the captures before. A term that
-belongs to the wall or the rig keeps, within their errors, the values that it had: one that is another map in
-every capture is no map of the wall.
+belongs to the wall or the rig must have the values that it had: a map that is another one in every capture is
+no map of the wall.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from nlos_lit.inference.uncertainty import Uncertainty
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
 
+HALF = 0.5  # of the gain of values fitted anew that those of before keep, if both are the same
 SAME = 0.02  # of the scanned wall's larger side, within which two scans are of the same wall points
 
 
@@ -110,6 +111,12 @@ def ask_further(
 def same_wall(before: Mapping[str, Any], now: Mapping[str, Any]) -> bool:
     """Whether two captures' facts say that the same part of the wall was scanned.
 
+    Args:
+        before, now: of :func:`~nlos_lit.inference.assemble.facts_of`.
+
+    Returns:
+        False also where one does not say it.
+
     Examples:
         >>> same_wall({"wall": [0.0, 1.0, 0.0, 1.0]}, {"wall": [0.01, 1.0, 0.0, 0.99]})
         True
@@ -138,24 +145,24 @@ class _Asking:
     def settled(self, term: Accepted, name: str) -> tuple[Accepted, Further]:
         """The term that stays, and what the capture ``name`` added on its group."""
         names, select = list(term.weights), self.split.select
-        held = [n for n in names if self.same and term.tried[n].values]
+        known = [n for n in names if self.same and term.tried[n].values]
         none = self._gone_on("none", begun_with(self.base, []))
-        asked = {c.name: c for c in self._asked([n for n in names if n not in held])}
-        begun = {n: begun_with(self.base, [c]) for n, c in asked.items()}
-        for n in held:
-            known = _effect(n, self.scan, term.tried[n])
-            begun[n] = copy_effects(self.base.extension, [known])
-        fits = {n: self._gone_on(n, begun[n]) for n in names}
         before = log_likelihood(none, select)
-        after = {n: log_likelihood(fit, select) for n, fit in fits.items()}
+        fits = {c.name: self._gone_on(c.name, begun_with(self.base, [c])) for c in self._asked(names)}
+        after = {n: log_likelihood(fits[n], select) for n in names}
         best = max(after.values(), key=lambda value: float(value.sum()))
         seen = weights([before, best], self.split.block[select])[0] <= self.options.open_share
         here = {n: nats_by_block(before, value, self.split) for n, value in after.items()}
-        tried = {}
-        for n in names:
-            nats = [*term.tried[n].nats, *here[n]]
-            again = replace(term.tried[n], nats=nats)
-            tried[n] = again if n in held else tried_with(asked[n], fits[n], nats)
+        kept = {}
+        for n in known:
+            effect = _effect(n, self.scan, term.tried[n].values)
+            fixed = self._gone_on(f"{n} as it was", copy_effects(self.base.extension, [effect]))
+            old = nats_by_block(before, log_likelihood(fixed, select), self.split)
+            anew = sum(here[n])
+            kept[n] = sum(old) / anew if anew > 0 else 1.0
+            if kept[n] < HALF:
+                fits[n], here[n] = fixed, old
+        tried = {n: tried_with(n, fits[n], [*term.tried[n].nats, *here[n]]) for n in names}
         share = _weights(tried)
         left = {n: w for n, w in share.items() if w > self.options.open_share}
         first = term.name if term.name in left else max(left, key=lambda n: left[n])
@@ -165,16 +172,15 @@ class _Asking:
             weights={n: left[n] / sum(left.values()) for n in order},
             split_by="; ".join(sorted({EFFECTS.splitting(first, n) for n in left} - {""})),
             tried={n: tried[n] for n in order},
+            advised=term.advised if len(order) > 1 else {},
         )
         if first != term.name:
             stays = replace(stays, name=first, parameters=self._parameters(fits[first], first))
         gained = {n: float(sum(values)) for n, values in here.items()}
-        return stays, Further(name, names, gained, held, seen, share, order)
+        return stays, Further(name, names, gained, kept, seen, share, order)
 
     def _asked(self, names: list[str]) -> list[Candidate]:
-        """Names whose values are fitted anew, as the pool sees them here."""
-        if not names:
-            return []
+        """What is open, as the pool sees it here."""
         lit = lit_by(self.base, self.scan)
         asking = partial(ask, self.base, self.split, lit, self.options.spots, self.seed, names)
         return self.steps("screen", "asking for what is open", "pool", asking)
@@ -198,23 +204,22 @@ def _weights(tried: Mapping[str, Tried]) -> dict[str, float]:
 
 
 def _begun(term: Accepted, scan: Scan, same: bool) -> Effect:
-    """An accepted term in another capture: from its values where these last, else from its null."""
-    return _effect(term.name, scan, term.tried.get(term.name, Tried([])) if same else Tried([]))
+    """An accepted term in another capture: with its values where these last, else at its null."""
+    return _effect(term.name, scan, term.tried[term.name].values if same and term.name in term.tried else {})
 
 
-def _effect(name: str, scan: Scan, known: Tried) -> Effect:
-    """An effect that begins where other captures found it, or at its null where nothing is known.
+def _effect(name: str, scan: Scan, values: Mapping[str, list[float]]) -> Effect:
+    """An effect with values that stay as they are, or at its null where there are none.
 
     Raises:
         UserError: the other scan gives it other coefficients.
     """
     effect = next(cls for cls in [*EFFECTS, *FREE] if cls.name == name)(scan)
-    for parameter, values in known.values.items():
-        value, error = (torch.tensor(v) for v in (values, known.errors[parameter]))
-        if len(value) != effect.declared[parameter].size:
+    for parameter, given in values.items():
+        if len(given) != effect.declared[parameter].size:
             raise UserError(f"the scans are too different: {name} has other coefficients in the second")
-        effect.begin_at(parameter, value, error)
-    return effect.requires_grad_(not effect.per_spot)
+        effect.set(parameter, torch.tensor(given))
+    return effect.requires_grad_(not values and not effect.per_spot)
 
 
 def _with(diagnosis: Diagnosis, before: Accepted, after: Accepted, further: Further) -> Diagnosis:

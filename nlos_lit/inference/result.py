@@ -69,9 +69,11 @@ class Followed:
     """The formula that comes nearest to a free term, see :mod:`nlos_lit.inference.distil`.
 
     Args:
-        name: of the formula. equation: in terms of x, from 0 to 1 along the axis.
+        name: of the formula. equation: in terms of x, and what x is.
         share: of the free term's gain on spots that were not fitted.
         offered: it keeps enough to be an effect of its own.
+        curve: ``[K + 1]`` its values at the edges of the free term's shape, a constant added that lays it
+            through that; None where the two are not of one kind.
     """
 
     name: str
@@ -79,6 +81,7 @@ class Followed:
     parameters: dict[str, Estimate]
     share: float
     offered: bool
+    curve: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -87,13 +90,11 @@ class Tried:
 
     Args:
         nats: gained over none, one number for each held-out wall block of each capture.
-        values: of its amplitudes, by name, in their units, if they are the same in other captures.
-        errors: of these.
+        values: of its amplitudes, by name, in their units, if other captures must have the same.
     """
 
     nats: list[float]
     values: dict[str, list[float]] = field(default_factory=dict)
-    errors: dict[str, list[float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -190,7 +191,8 @@ class Further:
         name: of that capture.
         asked: names that were open, the accepted one first.
         nats: what each gains there over none of them, on wall blocks that were not fitted.
-        held: names whose values were to stay, within their errors, what they were before.
+        kept: of names whose values must stay what they were, the share of the gain of values fitted anew
+            that those of before keep; below a half these contradict each other, and ``nats`` are theirs.
         seen: that capture asks for any of them by itself.
         weights: of all captures together, by name.
         stays: names that are left, the accepted one first.
@@ -199,7 +201,7 @@ class Further:
     name: str
     asked: list[str]
     nats: dict[str, float]
-    held: list[str]
+    kept: dict[str, float]
     seen: bool
     weights: dict[str, float]
     stays: list[str]

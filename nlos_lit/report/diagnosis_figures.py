@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from nlos_lit.inference.result import Accepted, Diagnosis, Profile, Screened, Shape
+from nlos_lit.inference.result import Accepted, Diagnosis, Followed, Profile, Screened, Shape
 from nlos_lit.report.quantities import amount_of, number, percent, plus_minus, scales, scales_of
 from nlos_lit.report.style import (
     BLACK,
@@ -57,7 +58,7 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
         shown[name] = residual_profile(profile, bin_length, calm) if flat else residual_wall(profile, calm)
     for term in diagnosis.unknown:
         if term.shape is not None:
-            shown[f"unknown_{term.name}"] = free_shape(term.name, term.shape, bin_length)
+            shown[f"unknown_{term.name}"] = free_shape(term.name, term.shape, bin_length, term.formula)
     shown["deviance"] = deviance_steps(diagnosis)
     terms = [*diagnosis.effects, *diagnosis.unknown]
     if any(term.parameters for term in terms):
@@ -161,13 +162,16 @@ def residual_wall(profile: Profile, calm: bool = False) -> Figure:
 
 
 @styled
-def free_shape(name: str, shape: Shape, bin_length: float | None = None) -> Figure:
+def free_shape(
+    name: str, shape: Shape, bin_length: float | None = None, formula: Followed | None = None
+) -> Figure:
     """What a free term does along its axis, or over two: a change in percent, or a delay; no change at 0.
 
     Args:
         name: of the term.
         shape: of it.
         bin_length: m; where it is known, delays are told in bins.
+        formula: that comes nearest, a line.
 
     Returns:
         One panel.
@@ -183,6 +187,10 @@ def free_shape(name: str, shape: Shape, bin_length: float | None = None) -> Figu
         else:
             axes.stairs(values, shape.edges, fill=True, color=PINK, alpha=0.35, linewidth=0)
             axes.stairs(values, shape.edges, baseline=None, color=PINK, linewidth=1.1)
+        if formula is not None and formula.curve is not None:
+            line, _ = _change(name, replace(shape, values=formula.curve), bin_length)
+            axes.plot(shape.edges, line, color=BLACK, linewidth=1.2, label=describe(formula.name).phrase)
+            axes.legend(frameon=False)
         axes.set(xlim=shape.edges[[0, -1]], xlabel=_along(shape.axis), ylabel=label)
         axes.margins(y=0.1)
         if shape.axis == "rate" and shape.edges[0] > 0:

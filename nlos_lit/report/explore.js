@@ -142,7 +142,7 @@
     const axis = (title) => ({ title: { text: title }, backgroundcolor: "#f4f4f4", showbackground: true, gridcolor: "#cfcfcf" });
     Plotly.newPlot("hidden", traces, { ...base, dragmode: "orbit", margin: { l: 0, r: 0, t: 0, b: 0 }, scene: { aspectmode: "data", dragmode: "orbit",
       xaxis: axis("x (m)"), yaxis: axis("y (m)"), zaxis: axis("z, depth (m)"),
-      camera: state.camera || { eye: { x: 0.45, y: 0.4, z: -1.95 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: 0, z: 0 } } } }, config);
+      camera: state.camera || { eye: { x: 0.45, y: 0.3, z: -2.05 }, up: { x: 0, y: 1, z: 0 }, center: { x: 0, y: -0.12, z: 0 } } } }, config);
     for (const { name, index } of shown3d) {
       const label = document.createElement("label"), box = document.createElement("input");
       box.type = "checkbox"; box.checked = traces[index].visible; box.dataset.trace = name;

@@ -116,7 +116,7 @@ def write_report(
 def _write_effect(formula: Followed, diagnosis: Diagnosis, folder: Path) -> None:
     """The file of a formula that a free term follows, as an effect of its own."""
     share, size = percent(formula.share), headline(formula.name, formula.parameters)
-    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of a free term's gain."
+    found = f"a diagnosis of {diagnosis.capture['name']}: {size}; {share} of the gain of a free term."
     kind = next(each for each in FORMULAS if each.name == formula.name)
     with whole_file(folder / f"{formula.name}.py") as partial:
         partial.write_text(written(kind, found), encoding="utf-8")
@@ -329,7 +329,8 @@ def _further(further: Further) -> str:
     text = (
         f"{told_apart(further)} Only what was open was asked, each beside a scene of that capture's own, and"
         " judged by parts of the wall that were not fitted. What belongs to the wall or to how the rig stands"
-        " keeps the values found before, within their errors."
+        " must have the values that it had: where these keep less than half of what values fitted anew gain,"
+        " it is judged by them."
     )
     return f"<p>{_text(text)}</p>" + _table(heads, rows(further), "cards")
 
@@ -345,8 +346,18 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         "A free term is a correction without a name, of any form along its axis."
         f" The most evidence is {held}."
     )
-    told = "".join(f"<p>{_text(follows(term))}</p>" for term in diagnosis.unknown)
+    told = "".join(f"<p>{_text(follows(term) + _offer(term))}</p>" for term in diagnosis.unknown)
     return f"<p>{_text(what)}</p>" + _accepted(diagnosis, diagnosis.unknown) + told
+
+
+def _offer(term: Accepted) -> str:
+    """Where the formula lies that a free term follows."""
+    if term.formula is None or not term.formula.offered:
+        return ""
+    return (
+        f" The file effects/{term.formula.name}.py beside this page holds it as an effect; copied to"
+        " nlos_lit/effects and named in its __init__.py it is one of the registry."
+    )
 
 
 def _scores(diagnosis: Diagnosis) -> str:

@@ -16,7 +16,8 @@ small, figcaption, .over { color: var(--soft); font-size: .85rem; }
 .next h2, header h2 { margin: 1rem 0 .2rem; border: 0; font-size: 1.02rem; }
 .next h2 + p, header h2 + p { margin-top: 0; }
 .next { border: 1px solid #0072B2; border-radius: .3rem; padding: .1rem 1rem .4rem; background: #f3f8fc; }
-.next pre { overflow-x: auto; background: #fff; border: 1px solid var(--line); padding: .4rem .6rem; }
+.next pre { white-space: pre-wrap; overflow-wrap: anywhere; }
+.next pre { background: #fff; border: 1px solid var(--line); padding: .4rem .6rem; }
 a { color: #005b8f; }
 .term { font-style: normal; border-bottom: 1px dotted #444; cursor: help; position: relative; }
 .term:hover::after, .term:focus::after { content: attr(data-says); position: absolute; z-index: 2; left: 0;

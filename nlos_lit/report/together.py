@@ -18,9 +18,9 @@ def told_apart(further: Further) -> str:
 
     Examples:
         >>> one = Further("scan_2", ["irf_tail", "afterpulsing"], {"irf_tail": 2.0, "afterpulsing": 90.0},
-        ...     [], True, {"irf_tail": 0.01, "afterpulsing": 0.99}, ["afterpulsing"])
+        ...     {}, True, {"irf_tail": 0.01, "afterpulsing": 0.99}, ["afterpulsing"])
         >>> print(told_apart(one))
-        With scan_2, a detector that answers itself (afterpulsing) alone stays: 99 % of the weight of all
+        With scan_2, afterpulsing (counts that trigger further counts) alone stays: 99 % of the weight of all
         captures together.
     """
     stays = [describe(name).phrase for name in further.stays]
@@ -51,11 +51,18 @@ def rows(further: Further) -> list[list[str]]:
         [
             f"{describe(name).phrase} ({name})",
             f"{number(further.nats[name])}",
-            "those found before, within their errors"
-            if name in further.held
-            else f"fitted to {further.name}",
+            _values(further, name),
             percent(further.weights[name], 2),
             "stays" if name in further.stays else "ruled out",
         ]
         for name in further.asked
     ]
+
+
+def _values(further: Further, name: str) -> str:
+    if name not in further.kept:
+        return "fitted anew"
+    share = further.kept[name]
+    return (
+        f"those found before keep {percent(share, 2)} of the gain" if share > 0 else "those found before fail"
+    )

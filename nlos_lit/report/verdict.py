@@ -202,19 +202,22 @@ def _free_terms(diagnosis: Diagnosis, what: str) -> str:
 
 
 def follows(term: Accepted) -> str:
-    """Which formula a free term follows, in a few sentences; empty where none was asked for."""
+    """Which formula a free term follows, in a few sentences.
+
+    Args:
+        term: that was accepted.
+
+    Returns:
+        Empty where none was asked for.
+    """
     formula = term.formula
     if formula is None:
         return ""
     size, kept = headline(formula.name, formula.parameters), percent(max(formula.share, 0.0))
-    told = f"{describe(formula.name).phrase}, {formula.equation} ({size})"
+    told = f"{describe(formula.name).phrase} (f = {formula.equation}; {size})"
     if not formula.offered:
         return f"No formula that was tried follows it; the nearest is {told}, which keeps {kept} of its gain."
-    return (
-        f"It follows {told}: this keeps {kept} of its gain on spots that were not fitted. The file"
-        f" effects/{formula.name}.py beside this page holds it as an effect; copied to nlos_lit/effects and"
-        " named in its __init__.py it is one of the registry."
-    )
+    return f"It follows {told}: this keeps {kept} of its gain on spots that were not fitted."
 
 
 def _held(diagnosis: Diagnosis) -> float | None:

@@ -7,6 +7,7 @@ import functools
 import logging
 import os
 import re
+import shlex
 import sys
 import warnings
 from collections.abc import Callable
@@ -17,7 +18,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 
 from nlos_lit.capture.errors import UserError
-from nlos_lit.places import INSTALLED
+from nlos_lit.places import INSTALLED, STARTED
 from nlos_lit.runtime.claim import refuse_links
 
 _FULL = "make room, or write elsewhere"
@@ -47,6 +48,12 @@ def typed(command: str) -> str:
     if INSTALLED or program.stem == "nlos" or program.parts[-2:] == ("nlos_lit", "__main__.py"):
         return f"nlos {command}"
     return f"python {FILES.get(command, command)}.py"
+
+
+def this_command() -> str:
+    """The command that this process carries out, to be typed again."""
+    name = os.environ.get(STARTED) or Path(sys.argv[0]).stem
+    return " ".join([typed(name), *map(shlex.quote, sys.argv[1:])])
 
 
 def as_typed(text: str) -> str:

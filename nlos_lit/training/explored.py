@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import shlex
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +19,7 @@ from nlos_lit.io.points import Points
 from nlos_lit.io.views import FILE as VIEW
 from nlos_lit.io.views import Mesh, View, read_view, write_view
 from nlos_lit.report.explore import write_page
+from nlos_lit.runtime.command_line import this_command
 from nlos_lit.training.shown import scanned_points
 from nlos_lit.training.summary import git_state, versions
 
@@ -121,7 +120,7 @@ def facts_of(
     now = datetime.datetime.now().astimezone()
     origin = {
         "file": scene.get("path") or (scene.get("source") or {}).get("file"),
-        "command": shlex.join(["python", Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": this_command(),
         "capture": {"spots": capture.n_spots, "bins": capture.n_bins, "sha256": capture.digest()},
         "provenance": capture.provenance,
         "git": git_state(),

@@ -10,6 +10,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.commands.look import VOXELS, coarser, look, main
 from nlos_lit.commands.simulate import simulate
 from nlos_lit.runtime.arguments import check_overrides
+from nlos_lit.runtime.command_line import words_as_settings
 from nlos_lit.training.configs import compose
 
 SMALL = ("bin_length=0.01", "n_bins=256", "mean_counts=2000")
@@ -45,6 +46,8 @@ def test_a_capture_is_checked_pictured_and_gone_on_with(confocal, tmp_path, caps
     assert [words[1].removesuffix(".py") for words in named] == ["train", "diagnose"]
     for _, program, *words in named:
         command = program.removesuffix(".py")
+        assert words == [str(confocal)]
+        words = words_as_settings(command, words)
         check_overrides(command, words)
         assert compose(command, words)["scene"]["path"] == str(confocal)
 

@@ -64,6 +64,8 @@ def test_what_a_capture_is_called_cannot_become_code(tmp_path):
     hostile = 'x"""\nraise SystemExit\n"""\\'
     text = written(BY_NAME["counts_over_scan_step"], hostile)
     assert "Source: xraise SystemExit" in text
+    assert "place −0.41 ± 3 %" in written(BY_NAME["counts_over_scan_step"], "place −0.41 ± 3 %")
+    assert max(map(len, text.splitlines())) <= 110
     assert loaded("counts_over_scan_step", tmp_path, hostile).name == "counts_over_scan_step"
 
 

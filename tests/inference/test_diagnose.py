@@ -158,7 +158,7 @@ def test_a_second_capture_is_asked_what_stays(finished, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     said = Diagnosis.read(file)
     (further,) = said.further
-    assert (further.name, further.asked, further.held) == ("second_scan", list(even), [])
+    assert (further.name, further.asked, further.kept) == ("second_scan", list(even), {})
     assert further.nats["background_slope"] > further.nats["direct_leak"]
     assert further.stays[0] == "background_slope"
     assert len(said.effects[0].tried["background_slope"].nats) == 32

@@ -12,6 +12,7 @@ from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import criticise
+from nlos_lit.inference.assemble import laid_through
 from nlos_lit.inference.criticise import CriticismSettings, Loop
 from nlos_lit.inference.distil import Follower, distil
 from nlos_lit.inference.split import split_spots
@@ -57,6 +58,10 @@ def test_a_jump_is_told_by_its_place_and_height():
     (step,) = found.fit.extension.effects
     assert float(step.value("place").detach()) == pytest.approx(0.6, abs=0.02)
     assert float(step.value("height").detach()) == pytest.approx(np.log(1.3), rel=0.1)
+    free = effect_of("free_scan", step.scan, field=torch.linspace(0, 1, 64))
+    line = laid_through(step, free, found.fit, torch.tensor([0.0, SIDE**2]))
+    assert line[1] - line[0] == pytest.approx(np.log(1.3), rel=0.1)
+    assert line.mean() == pytest.approx(0.5, abs=0.1), "as high as the term"
 
 
 def test_what_follows_no_formula_is_not_offered():

@@ -15,7 +15,7 @@ from nlos_lit.io.files import write_json
 
 TRIED = {"irf_tail": Tried([3.0, -1.0]), "afterpulsing": Tried([2.0, 0.5], {"decay": [0.1]})}
 AGAIN = Further(
-    "scan_2", list(TRIED), {"irf_tail": 4.0, "afterpulsing": 9.0}, [], True,
+    "scan_2", list(TRIED), {"irf_tail": 4.0, "afterpulsing": 9.0}, {"afterpulsing": 0.9}, True,
     {"irf_tail": 0.2, "afterpulsing": 0.8}, ["irf_tail", "afterpulsing"],
 )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -39,13 +40,16 @@ def test_what_to_do_next_depends_on_what_was_found():
     scene = ["scene=capture", "scene.path=my file.mat"]
     alone = next_step(two_found(effects=[TAIL_ALONE], groups=[]), scene)
     assert alone.text.startswith("Measure the instrument response on the direct pulse")
-    assert alone.command == "python train.py scene=capture 'scene.path=my file.mat' 'effects=[irf_tail]'"
+    assert alone.command == "nlos train scene=capture 'scene.path=my file.mat' 'effects=[irf_tail]'"
     both = next_step(two_found(effects=[TAIL_ALONE, TILT], groups=[]), scene)
     assert "effects=[irf_tail,wall_tilt]" in both.command
     assert both.text.startswith("Measure the wall's plane")  # of the larger gain
     open_ = next_step(two_found(effects=[TAIL], groups=[]), scene)
     assert open_.text.startswith("Tell the candidates apart: take a capture with other background light")
-    assert next_step(CASES["nothing"], ["scene=su"]).command == "python train.py scene=su refine=true"
+    asking = next_step(two_found(effects=[TAIL], groups=[]), scene, Path("outputs/my file/one"))
+    assert asking.command.splitlines()[0] == "nlos diagnose 'outputs/my file/one' --split-with FILE"
+    assert asking.command.splitlines()[1] == open_.command
+    assert next_step(CASES["nothing"], ["scene=su"]).command == "nlos train scene=su refine=true"
     assert "scene.volume.depth" in next_step(diagnosis(base=ABOVE, untouched_test={})).text
 
 
@@ -100,7 +104,8 @@ def test_nothing_is_red_where_nothing_was_found():
 def following(share: float, offered: bool) -> Diagnosis:
     """A free term along the scan that comes so near to a step."""
     numbers = {"height": Estimate(-0.117, 0.004, "1"), "place": Estimate(0.412, 0.003, "1")}
-    formula = Followed("counts_over_scan_step", "height σ((x - place)/0.01)", numbers, share, offered)
+    curve = np.where(np.arange(65) < 26, 0.0, -0.117)
+    formula = Followed("counts_over_scan_step", "height σ((x - place)/0.01)", numbers, share, offered, curve)
     term = dataclasses.replace(UNKNOWN["free_scan"], formula=formula)
     return dataclasses.replace(CASES["unexplained"], unknown=[term])
 
@@ -113,7 +118,7 @@ def test_a_formula_that_a_free_term_follows_is_told_and_left_as_a_file(tmp_path)
     assert said in next_step(following(0.97, True)).text
     assert "97 % of its gain" in text
     assert "class CountsOverScanStep(Step, CountsOverScan)" in file.read_text()
-    assert "97 % of a free term" in file.read_text()
+    assert "97 % of the gain of a free term" in " ".join(file.read_text().split())
 
 
 def test_a_formula_that_keeps_too_little_is_told_and_not_offered(tmp_path):
@@ -140,3 +145,10 @@ def test_what_another_capture_would_tell_is_said_where_names_are_open(order, sai
     assert said in next_step(open_).text
     assert said in report_html(open_, {})
     assert "By calculation" not in next_step(two_found(effects=[TAIL], groups=[])).text
+
+
+def test_the_formula_is_drawn_over_the_free_term():
+    figure = plots.diagnosis_figures(following(0.97, True))["unknown_free_scan"]
+    (line,) = [one for one in figure.axes[0].lines if len(one.get_ydata()) == 65]
+    assert line.get_ydata()[[0, -1]].tolist() == pytest.approx([0.0, 100 * np.expm1(-0.117)])
+    assert figure.axes[0].get_legend().get_texts()[0].get_text() == "a step over the course of the scan"

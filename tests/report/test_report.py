@@ -119,7 +119,7 @@ def test_json_is_the_diagnosis(written, case):
             "seconds",
             "seed",
         ),
-        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys"),
+        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys", "further"),
     }
     assert set(read["unexplained"]) == {"significant", "axis", "evidence"}
     for effect in [*read["effects"], *read["unknown"]]:
@@ -135,6 +135,7 @@ def test_json_is_the_diagnosis(written, case):
             "shape",
             "formula",
             "needed",
+            "tried",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
         assert set(effect["heldout_gain"]) == {
