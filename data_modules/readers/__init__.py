@@ -39,8 +39,7 @@ def read_capture(path: str | Path, fmt: str = "auto", *, options: ReaderOptions 
             cannot use.
     """
     options = options or ReaderOptions()
-    contents = open_contents(path)
-    reader = _recognise(contents) if fmt == "auto" else _named(fmt)
+    reader = _recognise(open_contents(path)) if fmt == "auto" else _named(fmt)
     for name in options.given:
         if name not in reader.OPTIONS:
             raise CaptureError(

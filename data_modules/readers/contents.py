@@ -37,6 +37,8 @@ OTHER_KINDS = MappingProxyType(
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 LARGEST = 1e30  # of a number that is read: sums of millions of them stand in single precision
 _MOST = 4096  # arrays of a file that are listed
+_SMALL = 2**20  # bytes that are there
+_CHUNK = 2**26  # bytes that HDF5 may unpack of a smaller array
 _DEFLATE_LIMIT = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
 
 
@@ -132,6 +134,9 @@ class Contents:
             raise CaptureError(
                 f"{name} in {self.path.name} does not hold real numbers (found {values.dtype})"
             )
+        if values.dtype.itemsize > 8:  # longer floats than any file of the field has
+            with np.errstate(all="ignore"):
+                return values.astype(np.float64)
         return values.astype(np.uint8) if values.dtype.kind == "b" else values
 
     def counts(self, name: str) -> np.ndarray:
@@ -187,9 +192,9 @@ class Contents:
         Raises:
             CaptureError: as of `read`, or another value.
         """
-        if self.ndim(name) < 0 or self.scalar(name) not in (0, 1):
+        if self.ndim(name) < 0 or (value := self.scalar(name)) not in (0, 1):
             raise CaptureError(f"{name} in {self.path.name} must be true or false (1 or 0)")
-        return bool(self.scalar(name))
+        return bool(value)
 
     def text(self, name: str) -> str:
         """A string of an HDF5 file; empty where it is absent or not text."""
@@ -210,8 +215,7 @@ class Contents:
                 f"{on_disk / 1e6:.3g} MB; "
                 "the file is damaged or truncated"
             )
-        free = psutil.virtual_memory().available
-        if entry.size > free:
+        if entry.size > _SMALL and entry.size > (free := psutil.virtual_memory().available):
             raise CaptureError(
                 f"{name} in {self.path.name} needs {entry.size / 1e9:.1f} GB and {free / 1e9:.1f} GB are "
                 "free; use a smaller file"
@@ -314,9 +318,24 @@ def _list_hdf5(path: Path, head: bytes) -> Contents:
             for label, dataset in members.items():
                 if isinstance(dataset, h5py.Dataset) and not dataset.is_virtual and not dataset.external:
                     matlab = matlab or "MATLAB_class" in dataset.attrs
-                    numeric = dataset.shape is not None and dataset.dtype.kind in "uifb"
-                    shape = dataset.shape or ()
-                    size = math.prod(shape) * dataset.dtype.itemsize
+                    shape, dtype = dataset.shape or (), dataset.dtype
+                    numeric = dataset.shape is not None and dtype.kind in "uifb"
+                    size = math.prod(shape) * dtype.itemsize
+                    chunks, limits = dataset.chunks or (), dataset.maxshape or ()
+                    if any(
+                        limit is not None and limit < chunk
+                        for limit, chunk in zip(limits, chunks, strict=False)
+                    ):
+                        raise CaptureError(
+                            f"{label} in {path.name} has chunks {chunks} where its shape is {limits} at "
+                            "most; the file is damaged"
+                        )
+                    chunk = math.prod(chunks) * dtype.itemsize
+                    if chunk > max(size, _CHUNK):
+                        raise CaptureError(
+                            f"{label} in {path.name} has {size / 1e6:.3g} MB in a chunk of {chunk / 1e6:.0f} "
+                            "MB; store it in smaller chunks"
+                        )
                     entries[label] = Entry(shape, numeric, size, dataset.shape is None)
     if matlab:
         entries = {name: replace(entry, shape=entry.shape[::-1]) for name, entry in entries.items()}
@@ -332,7 +351,7 @@ def _hard_links(group: h5py.Group) -> list[tuple[str, h5py.Group | h5py.Dataset]
 
 def _list_mat5(path: Path) -> Contents:
     with _damage(path):
-        listed = list_mat5(path)
+        listed = list_mat5(path, _MOST)
     # whole doubles may be stored in single bytes, so the least size counts
     entries = {name: Entry(shape, numeric, math.prod(shape)) for name, (shape, numeric) in listed.items()}
     return Contents(path, "mat5", entries)

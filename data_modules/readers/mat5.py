@@ -36,6 +36,7 @@ _TYPES = {
 _INT8, _INT32, _UINT32, _MATRIX, _COMPRESSED = 1, 5, 6, 14, 15
 _STRUCT, _NUMBERS = 2, range(6, 16)  # mx* classes
 _HEAD = 65536  # bytes that a matrix' name and shape lie in, packed or not
+_STRUCTS = 2**30  # bytes of packed structs that are unpacked to list a file
 _INFLATION = 1100  # deflate cannot exceed 1032-fold (zlib.net/zlib_tech.html)
 
 
@@ -55,22 +56,43 @@ class Variable:
         return self.kind in _NUMBERS and not self.complex
 
 
-def list_mat5(path: Path) -> dict[str, tuple[tuple[int, ...], bool]]:
+def list_mat5(path: Path, most: int) -> dict[str, tuple[tuple[int, ...], bool]]:
     """Shape and whether it holds real numbers, by name; fields of scalar structs as ``struct.field``.
 
+    Args:
+        path: of the file.
+        most: arrays that it may hold.
+
+    Returns:
+        name → shape, numeric.
+
     Raises:
+        CaptureError: it holds more, or packed structs of a size that would take long to list.
         ValueError: the bytes are not what the file says they are (zlib's errors pass through, too).
     """
     found: dict[str, tuple[tuple[int, ...], bool]] = {}
+    too_many = CaptureError(f"{path.name} holds more than {most} arrays; a capture holds a few")
+    left = _STRUCTS
     with path.open("rb") as stream:
         order = _order(stream)
-        for element in _variables(stream, order):
+        for number, element in enumerate(_variables(stream, order)):
+            if number == most:
+                raise too_many
             variable = _peek(element.kind, element.read(_HEAD), order)
             if variable is None:
                 continue
             found[variable.name] = (variable.shape, variable.numeric)
             if variable.kind == _STRUCT and math.prod(variable.shape) == 1:
-                for name, field in _fields(_whole(element.kind, element.read(), order), order):
+                body = element.read()
+                left -= _unpacked(body, order) if element.kind == _COMPRESSED else 0
+                if left < 0:
+                    raise CaptureError(
+                        f"{path.name} holds packed structs of more than {_STRUCTS / 1e9:.1f} GB; save "
+                        "the arrays by themselves, or without compression"
+                    )
+                for name, field in _fields(_whole(element.kind, body, order), order):
+                    if len(found) > most:
+                        raise too_many
                     found[f"{variable.name}.{name}"] = (field.shape, field.numeric)
     return found
 
@@ -180,12 +202,18 @@ def _peek(kind: int, body: memoryview, order: str) -> Variable | None:
     return _matrix(body, order) if kind == _MATRIX else None
 
 
+def _unpacked(body: memoryview, order: str) -> int:
+    """Bytes that a packed matrix says it has."""
+    size: int = struct.unpack_from(f"{order}I", zlib.decompressobj().decompress(body, 8), 4)[0]
+    return size
+
+
 def _whole(kind: int, body: memoryview, order: str) -> Variable:
     if kind != _COMPRESSED:
         return _matrix(body, order)
     stream = zlib.decompressobj()
-    head = stream.decompress(body, 8)
-    size = struct.unpack_from(f"{order}I", head, 4)[0]
+    stream.decompress(body, 8)  # the tag
+    size = _unpacked(body, order)
     if size > _INFLATION * len(body):
         raise ValueError(f"{len(body)} compressed bytes cannot hold {size}")
     data = stream.decompress(stream.unconsumed_tail, size + 64)  # to the end, so that zlib checks its sum

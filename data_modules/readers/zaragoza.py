@@ -57,11 +57,11 @@ def read(path: Path, options: ReaderOptions) -> Capture:
     confocal = contents.ndim("data") < 6
     last = _coordinates_last(contents, confocal)
     camera = _grid(contents, "cameraGridPositions", last)
-    normals = _grid(contents, "cameraGridNormals", last) if "cameraGridNormals" in contents else None
+    normals = _normals(contents, "cameraGridNormals", camera, last)
     laser, laser_normals = camera, normals
     if not confocal:
         laser = _grid(contents, "laserGridPositions", last)
-        laser_normals = _grid(contents, "laserGridNormals", last) if "laserGridNormals" in contents else None
+        laser_normals = _normals(contents, "laserGridNormals", laser, last)
     counts, colours, bounces = _transients(
         contents, camera.shape[:2], None if confocal else laser.shape[:2], last
     )
@@ -133,6 +133,19 @@ def _grid(contents: Contents, name: str, last: bool) -> np.ndarray:
             f"{name} in {contents.path.name} must be a grid of points; found shape {values.shape}"
         )
     return values if last else np.moveaxis(values, 0, -1)
+
+
+def _normals(contents: Contents, name: str, points: np.ndarray, last: bool) -> np.ndarray | None:
+    """``[a, b, 3]``, one at each point of a grid; None where the file has none."""
+    if name not in contents:
+        return None
+    normals = _grid(contents, name, last)
+    if normals.shape != points.shape:
+        raise CaptureError(
+            f"{name} in {contents.path.name} is {normals.shape[:2]} where the grid of points is "
+            f"{points.shape[:2]}"
+        )
+    return normals
 
 
 def _transients(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
 
+from data_modules.readers.contents import open_contents
 from data_modules.simulate.mesh import Mesh
 from data_modules.simulate.visibility import Occluder
 from data_modules.whole_hdf5 import whole_hdf5
@@ -113,27 +114,37 @@ def load_truth(path: str | Path) -> Truth:
         the truth, NaN where there is nothing; albedo 1 where the file says none.
 
     Raises:
-        UserError: no such file, not HDF5, or a key is missing.
+        UserError: no such file, not HDF5, damaged, or a key is missing.
     """
     path = Path(path)
     if not path.is_file():
         raise UserError(f"there is no ground-truth file {path}")
     if not h5py.is_hdf5(path):
         raise UserError(f"{path} is not an HDF5 file; ground truth is HDF5 with depth, normal, x and y")
-    with h5py.File(path, "r") as file:
-        missing = [name for name in ("x", "y", "depth", "normal") if name not in file]
-        if missing:
-            raise UserError(f"{path} lacks {', '.join(missing)}; ground truth holds depth, normal, x and y")
-        data = {name: file[name][()].astype(np.float64) for name in ("x", "y", "depth", "normal")}
-        nothing = ~(data["depth"] > 0)
-        data["depth"][nothing] = np.nan
-        data["normal"][nothing] = np.nan
-        albedo = file["albedo"][()].astype(np.float64) if "albedo" in file else np.where(nothing, np.nan, 1.0)
-        mesh = (
-            Mesh(*(file[f"mesh/{name}"][()] for name in ("vertices", "faces", "albedo")))
-            if "mesh" in file
-            else None
+    contents = open_contents(path)
+    missing = [name for name in ("x", "y", "depth", "normal") if name not in contents]
+    if missing:
+        raise UserError(f"{path} lacks {', '.join(missing)}; ground truth holds depth, normal, x and y")
+    data = {name: contents.read(name).astype(np.float64) for name in ("x", "y", "depth", "normal")}
+    shape = (data["x"].size, data["y"].size)
+    albedo = contents.read("albedo").astype(np.float64) if "albedo" in contents else np.ones(shape)
+    wanted = {"depth": shape, "normal": (*shape, 3), "x": shape[:1], "y": shape[1:]}
+    wrong = [name for name in wanted if data[name].shape != wanted[name]]
+    if wrong or albedo.shape != shape:
+        raise UserError(
+            f"{', '.join(wrong or ['albedo'])} in {path} must be as large as x and y say, {shape}; the "
+            "file is damaged"
         )
-        truth = Truth(**data, albedo=albedo, mesh=mesh)
-        extra = {name: file[name][()] for name in ("clean", "expected") if name in file}
-        return replace(truth, **extra, gain=float(file["gain"][()]) if "gain" in file else None)
+    nothing = ~(data["depth"] > 0)
+    data["depth"][nothing] = np.nan
+    data["normal"][nothing] = np.nan
+    if "albedo" not in contents:
+        albedo[nothing] = np.nan
+    parts = [f"mesh.{name}" for name in ("vertices", "faces", "albedo")]
+    try:
+        mesh = Mesh(*map(contents.read, parts)) if contents.has(*parts) else None
+    except ValueError as error:
+        raise UserError(f"the mesh in {path} is damaged: {error}") from error
+    extra = {name: contents.read(name) for name in ("clean", "expected") if name in contents}
+    gain = contents.scalar("gain") if "gain" in contents else None
+    return Truth(**data, albedo=albedo, mesh=mesh, **extra, gain=gain)

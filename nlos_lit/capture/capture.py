@@ -20,6 +20,7 @@ from nlos_lit.capture.errors import CaptureError
 SPEED_OF_LIGHT = 299_792_458.0  # m/s
 SHORTEST_BIN, LONGEST_BIN = 1e-9, 1e6  # m
 FARTHEST = 1e6  # m; squares of it stand in any precision
+LONGEST_EXPOSURE = 1e9  # s
 
 Value = TypeVar("Value")
 
@@ -139,8 +140,11 @@ class Capture:
             )
         if not np.isfinite(self.t_start):
             raise CaptureError(f"t_start must be finite; found {self.t_start}")
-        if self.exposure_s is not None and not 0 < self.exposure_s < math.inf:
-            raise CaptureError(f"exposure_s must be a positive number of seconds; found {self.exposure_s}")
+        if self.exposure_s is not None and not 0 < self.exposure_s <= LONGEST_EXPOSURE:
+            raise CaptureError(
+                f"exposure_s must be a positive number of seconds, at most {LONGEST_EXPOSURE:g}; found "
+                f"{self.exposure_s}"
+            )
         _check_counts(self.counts)
         first, last = (0, bins) if self.gate is None else (int(self.gate[0]), int(self.gate[1]))
         if not 0 <= first < last <= bins:
@@ -153,7 +157,7 @@ class Capture:
             _check_observed(self.observed, self.counts, (first, last))
         if self.scan_shape is not None:
             shape = tuple(int(n) for n in self.scan_shape)
-            if len(shape) not in (2, 4) or int(np.prod(shape)) != spots:
+            if len(shape) not in (2, 4) or math.prod(shape) != spots:
                 raise CaptureError(f"scan_shape {shape} does not hold the capture's {spots} spots")
             object.__setattr__(self, "scan_shape", shape)
         order = np.arange(spots) if self.scan_order is None else np.asarray(self.scan_order, dtype=np.int64)

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 
 from data_modules.load import load_scene, planned_scene, read_scene
 from nlos_lit.capture import Capture
+from nlos_lit.capture.errors import UserError
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.further import ask_further
@@ -19,8 +20,8 @@ from nlos_lit.report.page import write_report
 from nlos_lit.report.together import told_apart
 from nlos_lit.report.verdict import verdict
 from nlos_lit.runtime.progress import StepTicker
-from nlos_lit.training.configs import pipeline_of, plain_yaml, settings_of
-from nlos_lit.training.folder import file_name
+from nlos_lit.training.configs import pipeline_of, settings_of
+from nlos_lit.training.folder import file_name, plain_yaml
 from nlos_lit.training.watched import retell
 
 log = logging.getLogger(__name__)
@@ -56,6 +57,8 @@ def second_capture(settings: dict[str, Any], folder: Path | None) -> Second:
         UserError: it cannot be read, or not be diagnosed.
     """
     kept = settings if folder is None else plain_yaml(folder / "config.yaml")
+    if not all(isinstance(kept.get(name), dict) for name in ("scene", "model")):
+        raise UserError(f"{folder} holds no config of a run: config.yaml lacks its scene or its model")
     scene, now = OmegaConf.create(kept["scene"]), OmegaConf.create({"scene": settings["scene"]})
     for item in HydraConfig.get().overrides.task:
         key = item.partition("=")[0]

@@ -10,7 +10,7 @@ from pathlib import Path
 from nlos_lit.capture.errors import UserError
 from nlos_lit.io.views import FILE as VIEW
 from nlos_lit.io.views import read_view
-from nlos_lit.runtime.claim import claim
+from nlos_lit.runtime.claim import claim, refuse_links
 from nlos_lit.runtime.command_line import typed
 
 
@@ -40,12 +40,13 @@ def page_of(run: Path) -> Path:
         ``explore.html``.
 
     Raises:
-        UserError: the folder holds nothing to look at.
+        UserError: the folder holds nothing to look at, or links out of it.
     """
     from nlos_lit.report.explore import FILE as PAGE  # after the arguments: it loads torch
     from nlos_lit.report.explore import write_page
     from nlos_lit.training.explored import mark_interrupted
 
+    refuse_links(run)
     folder = run / "diagnosis" if (run / "diagnosis" / VIEW).is_file() else run
     view = read_view(folder)
     if view.facts["status"] == "running" and not _held(folder):

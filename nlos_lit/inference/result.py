@@ -12,8 +12,11 @@ from typing import Any, cast, get_args, get_origin, get_type_hints
 import numpy as np
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.io.files import plain
 from nlos_lit.metrics.transients import Scores
+
+LARGEST = 2**28  # bytes of a diagnosis
 
 
 @dataclass(frozen=True)
@@ -255,7 +258,7 @@ class Diagnosis:
             UserError: the file is missing, damaged, or of an earlier version.
         """
         try:
-            return cast(Diagnosis, _made(Diagnosis, json.loads(file.read_text(encoding="utf-8"))))
+            return cast(Diagnosis, _made(Diagnosis, json.loads(bounded(file, LARGEST))))
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise UserError(
                 f"{file} holds no diagnosis of this version; diagnose the capture again"

@@ -20,6 +20,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.capture.scan import Scan
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.pool import ask
@@ -132,8 +133,8 @@ def read_toys(files: list[Path]) -> Null:
 
 def _read_toy(file: Path) -> float:
     try:
-        return float(json.loads(file.read_text())["largest"])
-    except (ValueError, KeyError, TypeError) as error:
+        return float(json.loads(bounded(file))["largest"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(f"{file} is damaged, or holds no toy: move it away") from error
 
 

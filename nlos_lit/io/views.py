@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import archived
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.io.files import plain, whole_file
 from nlos_lit.io.points import Points
@@ -146,7 +145,7 @@ def read_view(folder: Path | str) -> View:
     """
     file = Path(folder) / FILE
     try:
-        content = io.BytesIO(file.read_bytes())  # NumPy leaves a damaged file open
+        content = io.BytesIO(archived(file, packed=True).read_bytes())  # NumPy leaves a damaged file open
         with np.load(content, allow_pickle=False) as kept:
             header = json.loads(str(kept["header"]))
             arrays = {name: kept[name] for name in kept.files if name != "header"}
@@ -156,15 +155,7 @@ def read_view(folder: Path | str) -> View:
             f"{folder} holds no {FILE}: it is no run's folder, or the run is of an earlier version; "
             "give the folder that a train or diagnose command has named at its end"
         ) from error
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except Exception as error:  # a foreign file may be wrong in any way
         raise UserError(f"{file} is damaged: {error}") from error
 
 

@@ -13,6 +13,7 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.io.files import whole_file
 
 AXES = ("x", "y", "z")
+PACKING = 1100  # deflate cannot shrink more than 1032-fold (zlib.net/zlib_tech.html)
 
 
 def write_volume(
@@ -83,9 +84,14 @@ def read_volume(path: Path | str) -> tuple[np.ndarray, VolumeGrid, dict[str, np.
     try:
         with h5py.File(path, "r") as file:
             origin, pitch = (tuple(float(v) for v in file.attrs[name]) for name in ("origin", "pitch"))
-            volumes = {name: file[name][()] for name in file if name not in AXES}
+            own = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
+            held = [file[name] for name in own if name not in AXES]
+            most = PACKING * Path(path).stat().st_size
+            if sum(item.nbytes for item in held) > most or any(item.external for item in held):
+                raise ValueError("it claims more than it can hold")
+            volumes = {item.name.removeprefix("/"): item[()] for item in held}
             volume = volumes.pop("volume")
-    except (OSError, KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # a foreign file may be wrong in any way
         raise UserError(
             f"{path} is not a volume.h5 (a dataset 'volume', its grid as attributes): {error}"
         ) from error

@@ -7,7 +7,9 @@ import logging
 import multiprocessing
 import os
 import runpy
+import signal
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,7 +116,16 @@ def run_training(arguments: list[str], output: Path) -> int:
     return process.exitcode
 
 
+def _end_with_parent() -> None:
+    """Stop this process as ``kill`` does once the one that wanted it is gone, which may be killed itself."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this is a child
+    parent.join()
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def _train(arguments: list[str], output: Path) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     with output.open("w") as file:
         for stream in (1, 2):
             os.dup2(file.fileno(), stream)

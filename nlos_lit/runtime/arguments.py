@@ -12,7 +12,7 @@ import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from hydra._internal.utils import get_args_parser
@@ -237,8 +237,21 @@ def check_config(command: str, config: DictConfig) -> None:
         plain = OmegaConf.to_container(config, resolve=True)
     except OmegaConfBaseException as error:
         raise UserError(f"the config cannot be put together: {str(error).splitlines()[0]}") from error
+    check_values(command, cast(dict[str, Any], plain))
+
+
+def check_values(command: str, config: Mapping[str, Any]) -> None:
+    """As :func:`check_config`, of plain containers.
+
+    Args:
+        command: as there.
+        config: sections may be missing; what is there is checked.
+
+    Raises:
+        UserError: as there.
+    """
     rules = KEYS[command]
-    for key, value in _leaves(rules, plain):
+    for key, value in _leaves(rules, config):
         if any(f"{key}.".startswith(f"{section}.") for section in FOREIGN_SECTIONS):
             continue
         if value == "???":

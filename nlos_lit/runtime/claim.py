@@ -12,6 +12,18 @@ LOCK = ".lock"
 _held: dict[Path, int] = {}
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse the folder of a run, which may come from anywhere, with links to files elsewhere.
+
+    Raises:
+        UserError: a link leads out of it.
+    """
+    folder = folder.resolve()
+    for path in folder.rglob("*"):
+        if path.is_symlink() and not path.resolve().is_relative_to(folder):
+            raise UserError(f"{path} is a link out of its run's folder; put what it leads to in its place")
+
+
 def claim(folder: Path) -> None:
     """Hold a folder until this process ends, however it ends; the folder is made where it is not there.
 

@@ -19,6 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.places import INSTALLED, STARTED
+from nlos_lit.runtime.claim import refuse_links
 
 _FULL = "make room, or write elsewhere"
 _CLOSED = "change who may write there, or give another place"
@@ -97,7 +98,7 @@ def stay_in_run(arguments: list[str]) -> None:
     """With ``run=FOLDER``, add arguments that keep log and config in it.
 
     Raises:
-        UserError: it is no run's folder.
+        UserError: it is no run's folder, or holds links out of it.
     """
     given = given_values(arguments)
     if given.get("run", "null") == "null":
@@ -105,6 +106,7 @@ def stay_in_run(arguments: list[str]) -> None:
     folder = Path(given["run"])
     if not (folder / "config.yaml").exists():
         raise UserError(f"{folder} is not the folder of a finished run: config.yaml is missing")
+    refuse_links(folder)
     if "hydra.run.dir" not in given:
         arguments += [f"hydra.run.dir='{folder}'", "hydra.output_subdir=diagnosis/.hydra"]
 

@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import archived
 
 NO_OBJECTS: Mapping[str, Any] = MappingProxyType({})
 
@@ -144,7 +145,7 @@ def read_plain(file: Path, kinds: Sequence[Kind] = (), shared: Mapping[str, Any]
         return {"list": list, "tuple": tuple}[what](together(part, arrays) for part in held)
 
     try:
-        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as archive:
+        with np.load(io.BytesIO(archived(file).read_bytes()), allow_pickle=False) as archive:
             return together(json.loads(archive["tree"].tobytes()), archive)
     except Exception as error:  # a foreign file may be wrong in any way
         raise not_ours(file) from error

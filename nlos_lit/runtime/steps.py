@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.runtime.plain_file import Kind, not_ours, read_plain, record, write_plain, write_whole
 
 T = TypeVar("T")
@@ -55,7 +56,7 @@ class Steps:
         self.report, self.folder, self.settings = report, folder, settings
         self.know(kinds)
         made_with = None if folder is None else folder / SETTINGS
-        if made_with is not None and made_with.is_file() and made_with.read_text() != settings:
+        if made_with is not None and made_with.exists() and bounded(made_with) != settings.encode():
             raise UserError(
                 f"{folder} holds the steps of an interrupted diagnosis with other settings; go on with the "
                 "same settings, choose another folder, or move it away"

@@ -14,10 +14,8 @@ from typing import Any, TypeVar, cast
 
 import hydra
 import lightning as L
-import yaml
 from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
@@ -25,9 +23,11 @@ from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.places import CONF
+from nlos_lit.runtime.arguments import check_values
+from nlos_lit.runtime.keys import KEYS
 from nlos_lit.runtime.memory import parse_bytes
 from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.training.folder import register_names
+from nlos_lit.training.folder import plain_yaml, register_names
 from nlos_lit.training.instantiate import arguments_of
 
 SETTINGS: dict[str, type] = {
@@ -35,8 +35,11 @@ SETTINGS: dict[str, type] = {
     "surfels": SurfelSettings,
     "criticism": CriticismSettings,
 }
-LARGEST_CONFIG = 2**19  # bytes of a run's config.yaml
-DEEPEST_CONFIG = 32  # lists and mappings in each other
+STARTS = ("ckpt_path", "run")  # what a run came from, which need not be there any more
+# Of a run's config: what opening the run does not read, or what may be null as a whole.
+MADE = tuple(f"simulate.{name}" for name in ("mesh", "scan", "sensor"))
+MADE += tuple(f"source.{name}" for name in ("file", "origin", "url", "sha256"))
+UNREAD = (*STARTS, "folder", "trainer", "scene.simulate.", "scene.source.")
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
 T = TypeVar("T")
 
@@ -95,27 +98,6 @@ def settings_of(kind: Callable[..., T], values: Mapping[str, Any], where: str, *
         raise UserError(f"{where} is incomplete: {error}") from error
 
 
-def plain_yaml(file: Path) -> dict[str, Any]:
-    """A config that a run has written; the file may come from anywhere, and be made to take all memory."""
-    foreign = UserError(f"{file} is damaged, or not written by this program")
-    if file.stat().st_size > LARGEST_CONFIG:
-        raise foreign
-    text = file.read_text(encoding="utf-8", errors="replace")
-    try:
-        depth = 0
-        for event in yaml.parse(text, yaml.CSafeLoader):
-            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-            # An alias names what stands elsewhere: a few lines of them may stand for billions.
-            if isinstance(event, yaml.AliasEvent) or depth > DEEPEST_CONFIG:
-                raise foreign
-        config = OmegaConf.to_container(OmegaConf.create(text))
-    except (yaml.YAMLError, OmegaConfBaseException, RecursionError, ValueError) as error:
-        raise foreign from error
-    if not isinstance(config, dict):
-        raise foreign
-    return cast(dict[str, Any], config)
-
-
 def pipeline_of(
     settings: Mapping[str, Any], scene: Mapping[str, Any], model: Mapping[str, Any]
 ) -> BasePipeline:
@@ -150,25 +132,49 @@ def run_config(folder: str | Path) -> dict[str, Any]:
         Plain containers with every section that opening the run reads.
 
     Raises:
-        UserError: the folder is not a run's, or another version of the project wrote it.
+        UserError: the folder is not a run's, another version of the project wrote it, or it holds values that
+            cannot be.
     """
     file = Path(folder) / "config.yaml"
     if not file.is_file():
         raise UserError(f"{folder} is not the folder of a finished run: {file.name} is missing")
     config = plain_yaml(file)
-    missing = {"scene", "model", "objective", "optimizer", "surfels", "export"} - set(config)
-    unread = {
-        f"{name}.{key}"
-        for name in ("model", "surfels")
-        for key in set(config.get(name, ())) - {field.name for field in dataclasses.fields(SETTINGS[name])}
+    rules = [*(key for key in KEYS["train"] if not key.startswith(UNREAD)), "optimizer.method"]
+    rules += [f"scene.{key}" for key in MADE if _section(config, f"scene.{key.split('.')[0]}")]
+    missing = {key.split(".")[0] for key in rules} - set(config)
+    missing |= {key for key in rules if key.split(".")[0] in config and not _is_in(config, key)}
+    known = {
+        **{
+            name: [field.name for field in dataclasses.fields(SETTINGS[name])]
+            for name in ("model", "surfels")
+        },
+        "scene.volume": inspect.signature(volume_grid).parameters,
     }
-    if "scene" in config:
-        grid = inspect.signature(volume_grid).parameters
-        unread |= {f"scene.volume.{key}" for key in set(config["scene"]["volume"]) - set(grid)}
+    unread = {
+        f"{section}.{key}"
+        for section in known
+        for key in set(_section(config, section)) - set(known[section])
+    }
     if missing or unread:
         found = [*(f"no {name}" for name in sorted(missing)), *sorted(unread)]
         raise UserError(
             f"{file} was written by another version of this project and cannot be opened (it has "
             f"{', '.join(found)}); train the scene again, or use the version that its summary.json names"
         )
+    try:
+        check_values("train", {key: value for key, value in config.items() if key not in STARTS})
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
     return config
+
+
+def _section(config: Any, name: str) -> dict[str, Any]:
+    """A section by its dotted name; empty where it is missing or none."""
+    for part in filter(None, name.split(".")):
+        config = config.get(part) if isinstance(config, dict) else None
+    return config if isinstance(config, dict) else {}
+
+
+def _is_in(config: Mapping[str, Any], key: str) -> bool:
+    section, _, name = key.rpartition(".")
+    return name in _section(config, section)

@@ -15,10 +15,12 @@ from typing import Any, cast
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.io.files import whole_file, write_json
-from nlos_lit.runtime.claim import claim
+from nlos_lit.runtime.claim import claim, refuse_links
 from nlos_lit.runtime.command_line import given_values, typed
 
 OUTPUTS = "outputs"  # where results go that no other folder is given for
@@ -31,6 +33,8 @@ HOLDS = MappingProxyType(
         OVERRIDES: "an interrupted run",
     }
 )
+LARGEST_CONFIG = 2**19  # bytes of a run's config.yaml
+DEEPEST_CONFIG = 32  # lists and mappings in each other
 LEAST = 2**18  # bytes, of what a command writes before it knows how much it will write
 LONGEST_NAME = 64  # characters of a capture's name
 # Processes that help another with its run have a number above 0 in one of these.
@@ -65,11 +69,14 @@ def take_folder(folder: Path, goes_on: bool = False) -> None:
         goes_on: the command continues what is there.
 
     Raises:
-        UserError: another process is at work there, or it holds a run and is not to go on from it.
+        UserError: another process is at work there, it holds a run and is not to go on from it, or it goes on
+            and holds links out of it.
     """
     if any(int(os.environ.get(name, 0)) for name in RANKS):
         return
     claim(folder)
+    if goes_on:
+        refuse_links(folder)
     found = next((what for name, what in HOLDS.items() if (folder / name).exists()), None)
     if found is not None and not goes_on:
         again = shlex.quote(f"resume={folder}")
@@ -149,7 +156,7 @@ def begun_with(folder: Path) -> list[str]:
         file = folder / ".hydra" / "overrides.yaml"  # a diagnosis of a capture
     altered = UserError(f"{file} was altered: it must be a list of settings such as scene.iterations=100")
     try:
-        content = file.read_bytes()
+        content = bounded(file)
         settings = json.loads(content) if file.suffix == ".json" else yaml.safe_load(content)
     except (ValueError, RecursionError, yaml.YAMLError, FileNotFoundError) as error:
         raise altered from error
@@ -176,6 +183,29 @@ def write_config(settings: Mapping[str, Any], folder: Path) -> None:
     """
     with whole_file(folder / "config.yaml") as partial:
         partial.write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))), encoding="utf-8")
+
+
+def plain_yaml(file: Path) -> dict[str, Any]:
+    """A config that a run has written; the file may come from anywhere, and be made to take all memory.
+
+    Raises:
+        UserError: it is no YAML of ours.
+    """
+    foreign = UserError(f"{file} is damaged, or not written by this program")
+    try:
+        text = bounded(file, LARGEST_CONFIG).decode("utf-8", errors="replace")
+        depth = 0
+        for event in yaml.parse(text, yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            # An alias names what stands elsewhere: a few lines of them may stand for billions.
+            if isinstance(event, yaml.AliasEvent) or depth > DEEPEST_CONFIG:
+                raise foreign
+        config = OmegaConf.to_container(OmegaConf.create(text))
+    except (UserError, yaml.YAMLError, OmegaConfBaseException, RecursionError, ValueError) as error:
+        raise foreign from error
+    if not isinstance(config, dict):
+        raise foreign
+    return cast(dict[str, Any], config)
 
 
 def begin_training(settings: Mapping[str, Any], folder: Path, checkpoint: Path | None) -> None:

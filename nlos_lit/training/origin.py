@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import archived
 from nlos_lit.runtime.command_line import typed
 
 # Settings that a checkpoint fits no other of, by what goes on from it; the capture is compared itself.
@@ -51,14 +53,15 @@ def check_origin(file: Path, origin: Mapping[str, Any], sections: Sequence[str])
         UserError: it is another's, with what differs, or no checkpoint of this project.
     """
     kept = read_checkpoint(file)["origin"]
-    theirs, mine = kept["settings"], origin["settings"]
-    differ = [
-        name
-        for name in sorted(theirs.keys() | mine.keys())
-        if theirs.get(name) != mine.get(name) and name not in BESIDE
-    ]
+    with sound(file):
+        theirs, mine = kept["settings"], origin["settings"]
+        differ = [
+            name
+            for name in sorted(theirs.keys() | mine.keys())
+            if theirs.get(name) != mine.get(name) and name not in BESIDE
+        ]
+        same_capture = kept["capture"] == origin["capture"]
     told = [name for name in differ if any(f"{name}.".startswith(f"{section}.") for section in sections)]
-    same_capture = kept["capture"] == origin["capture"]
     if not same_capture:  # the scene's settings may tell why
         told += [name for name in differ if name.startswith("scene.") and name not in told]
     words = [f"{name}={theirs.get(name)}, this command has {mine.get(name)}" for name in told[:TOLD]]
@@ -68,16 +71,27 @@ def check_origin(file: Path, origin: Mapping[str, Any], sections: Sequence[str])
         raise UserError(f"{file} was made with {'; '.join(words)}: give the same, or begin anew without it")
 
 
+@contextmanager
+def sound(file: Path) -> Iterator[None]:
+    """What is done with the content of a checkpoint, which may come from anywhere and be wrong in any way.
+
+    Raises:
+        UserError: whatever else was raised, as one sentence.
+    """
+    try:
+        yield
+    except Exception as error:
+        raise UserError(f"{file} is damaged, or no checkpoint: give one of a run's checkpoints/") from error
+
+
 def read_checkpoint(file: Path) -> dict[str, Any]:
     """A checkpoint of a fit, on the CPU; it may come from anywhere.
 
     Raises:
         UserError: it is damaged, or does not say what it was fitted to.
     """
-    try:
-        state = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # a foreign file may be wrong in any way
-        raise UserError(f"{file} is damaged, or no checkpoint: give one of a run's checkpoints/") from error
+    with sound(file):
+        state = torch.load(archived(file), map_location="cpu", weights_only=True)
     if not isinstance(state, dict) or "origin" not in state:
         raise UserError(
             f"{file} does not say which capture and settings it was fitted with (another version of this "
@@ -98,9 +112,11 @@ def finished_checkpoint(folder: Path) -> Path:
             f"{folder} is not the folder of a finished self-calibration: checkpoints/last.ckpt is missing"
         )
     state = read_checkpoint(file)
-    if "final" not in state.get("scores", ()):
+    with sound(file):
+        whole, done = "final" in state.get("scores", ()), state.get("epoch", -1) + 1
+    if not whole:
         raise UserError(
-            f"the run in {folder} was stopped after {state.get('epoch', -1) + 1} iterations; "
+            f"the run in {folder} was stopped after {done} iterations; "
             f"finish it first: {typed('train')} {shlex.quote(f'resume={folder}')}"
         )
     return file

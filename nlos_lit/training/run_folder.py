@@ -31,7 +31,14 @@ from nlos_lit.runtime.progress import planes_progress
 from nlos_lit.training.configs import run_config, settings_of
 from nlos_lit.training.folder import OVERRIDES, begun_from
 from nlos_lit.training.instantiate import builder
-from nlos_lit.training.origin import IMAGE, check_origin, finished_checkpoint, origin_of, read_checkpoint
+from nlos_lit.training.origin import (
+    IMAGE,
+    check_origin,
+    finished_checkpoint,
+    origin_of,
+    read_checkpoint,
+    sound,
+)
 from nlos_lit.training.self_calibration import SelfCalibration
 
 log = logging.getLogger(__name__)
@@ -196,8 +203,9 @@ def load_fitted(run: Run, checkpoint: Path) -> None:
         checkpoint: of the fitted run.
     """
     state = read_checkpoint(checkpoint)
-    run.module.load_state_dict(state["state_dict"])
-    run.module.scores = state["scores"]
+    with sound(checkpoint):
+        run.module.load_state_dict(state["state_dict"])
+        run.module.scores = state["scores"]
 
 
 def find_checkpoint(

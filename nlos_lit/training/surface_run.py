@@ -14,6 +14,7 @@ import torch
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import archived
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
@@ -35,6 +36,7 @@ from nlos_lit.surfels.fitted import FittedSurfels, fitted_surfels
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.start import seed_surfels
 from nlos_lit.training.configs import settings_of
+from nlos_lit.training.origin import sound
 from nlos_lit.training.outcome import geometry_of
 from nlos_lit.training.run_folder import Run
 from nlos_lit.training.shown import shown_spots, transients_of
@@ -211,10 +213,11 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
                 f"{folder} holds no refined surfels: refined/{name} is missing; "
                 f"run {typed('train')} with refine=true, effects=[…] or model=surface"
             )
-    saved = torch.load(place / "effects.pt", map_location="cpu", weights_only=True)
-    extension = Extension(build_effects(saved["names"], Scan.of(capture)))
-    extension.load_state_dict(saved["state"])
-    model = SurfelModel.from_state(
-        capture, torch.load(place / "surfels.pt", map_location="cpu", weights_only=True)
-    )
+    with sound(place / "effects.pt"):
+        saved = torch.load(archived(place / "effects.pt"), map_location="cpu", weights_only=True)
+        extension = Extension(build_effects(saved["names"], Scan.of(capture)))
+        extension.load_state_dict(saved["state"])
+    with sound(place / "surfels.pt"):
+        state = torch.load(archived(place / "surfels.pt"), map_location="cpu", weights_only=True)
+        model = SurfelModel.from_state(capture, state)
     return model, extension

@@ -11,18 +11,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.foreign import bounded
 from nlos_lit.io.files import whole_file
 from nlos_lit.io.tables import markdown_table, write_csv
 from nlos_lit.io.volumes import read_volume
 from nlos_lit.report.fronts import View, front_views
 from nlos_lit.report.style import save_figure
+from nlos_lit.training.folder import plain_yaml
 
 log = logging.getLogger(__name__)
 
@@ -225,8 +226,11 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     for name in ("config.yaml", "summary.json"):
         if not (folder / name).is_file():
             raise UserError(f"{folder} is not the folder of a finished run: {name} is missing")
-    config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
-    return config, json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    try:
+        summary = json.loads(bounded(folder / "summary.json"))
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"{folder / 'summary.json'} is damaged, or not written by this program") from error
+    return plain_yaml(folder / "config.yaml"), summary
 
 
 def _settings(config: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
@@ -247,7 +251,7 @@ def _at(summary: Any, keys: Iterable[str]) -> Any:
         if not isinstance(summary, dict) or key not in summary:
             return None
         summary = summary[key]
-    return summary
+    return summary if isinstance(summary, int | float) else None
 
 
 def _show(value: Any) -> str:

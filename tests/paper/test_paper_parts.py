@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 import yaml
+from conftest import ROOT
 
 from data_modules.simulate import SCENES, ScanPlan, simulate_capture
 from nlos_lit.capture.errors import UserError
@@ -155,3 +158,27 @@ def test_what_is_written_by_hand_stays():
     assert new == text.replace("old", "fresh \\1")
     with pytest.raises(UserError, match="must hold one part between <!-- generated: c -->"):
         replace_part(text, "c", "")
+
+
+ALONE = """
+import multiprocessing, sys, threading, time
+from nlos_lit.paper.workspace import _end_with_parent
+
+
+def child():
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    print("begun", flush=True)
+    time.sleep(60)
+
+
+multiprocessing.get_context("fork").Process(target=child).start()
+time.sleep(60)
+"""
+
+
+def test_a_training_ends_with_the_command_that_wanted_it():
+    command = subprocess.Popen([sys.executable, "-c", ALONE], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert command.stdout is not None
+    assert command.stdout.readline() == "begun\n"
+    command.kill()
+    assert command.communicate(timeout=20)[0] == ""  # the end of the output: nobody holds it any more

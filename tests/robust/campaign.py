@@ -39,9 +39,12 @@ def tables(rows: list[dict[str, Any]]) -> str:
     """Markdown of all parts: how many were tried, refused, accepted, failed."""
     told = []
     for part, title in TITLES.items():
-        of_part = [row for row in rows if row["part"] == part]
-        if not of_part:
+        made = [row for row in rows if row["part"] == part]
+        if not made:
             continue
+        of_part = [
+            summed([row for row in made if _name(row) == name]) for name in dict.fromkeys(map(_name, made))
+        ]
         kills = part == "kills"
         head = "| | kills (KILL, INT, TERM) | chains | ended alike | failed |" if kills else (
             "| | tried | refused | told of | accepted | failed |"
@@ -51,9 +54,23 @@ def tables(rows: list[dict[str, Any]]) -> str:
         failures = [line for row in of_part for line in _failures(row)]
         if failures:
             told += ["", "Failed, as it was said:", "", *failures]
-        where = sorted({f"`{row['command']}` at {row['commit']}" for row in of_part})
+        where = sorted({f"`{row['command']}` at {row['commit']}" for row in made})
         told += ["", "Made by:", "", *(f"- {one}" for one in where), ""]
     return "\n".join(told).rstrip()
+
+
+def summed(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Runs of one command or format as one: numbers added, lists joined."""
+    whole = dict(rows[0])
+    for row in rows[1:]:
+        for key, value in row.items():
+            if isinstance(value, dict):
+                whole[key] = {
+                    name: whole[key].get(name, 0) + value.get(name, 0) for name in {**whole[key], **value}
+                }
+            elif isinstance(value, int | float | list):
+                whole[key] = whole[key] + value
+    return whole
 
 
 def _name(row: dict[str, Any]) -> str:

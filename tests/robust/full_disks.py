@@ -1,7 +1,7 @@
 """Commands whose disk is too small, or is filled by another while they work.
 
-``python tests/robust/full_disks.py OUT.jsonl [seed=0]`` adds a row a command. It mounts small
-tmpfs, which needs root.
+``python tests/robust/full_disks.py OUT.jsonl [seed=0] [only=train,diagnose]`` adds a row a command. It mounts
+small tmpfs, which needs root.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def main(arguments: list[str]) -> None:
     torch.set_num_threads(1)
     os.chdir(Path(__file__).resolve().parents[2])
     place = Path(tempfile.mkdtemp(prefix="full-"))
-    for name in COMMANDS:
+    for name in given["only"].split(",") if "only" in given else COMMANDS:
         came: dict[str, int] = {"refused": 0, "done": 0, "failed": 0}
         failures = []
         began = time.monotonic()

@@ -21,9 +21,9 @@ import numpy as np
 import reader_files
 import scipy.io
 
-from data_modules.examine import examine
+from data_modules.examine import describe, examine
 from data_modules.nonsense import nonsense
-from data_modules.readers import ReaderOptions, read_capture
+from data_modules.readers import ReaderOptions, detect_format, read_capture
 from nlos_lit.capture.errors import CaptureError
 
 HANG = 10  # s
@@ -187,7 +187,7 @@ def outcome_of_file(fmt: str, name: str, blob: bytes, folder: Path, look: bool =
         name: of the writer that the file comes from.
         blob: the file.
         folder: for it; the other parts of a format that has several lie there.
-        look: whether it is looked over as ``inspect_capture.py`` does.
+        look: whether its format is recognised and it is looked over, as ``inspect_capture.py`` does.
 
     Returns:
         ``read`` or ``refused``; every other end is an exception.
@@ -195,16 +195,19 @@ def outcome_of_file(fmt: str, name: str, blob: bytes, folder: Path, look: bool =
     path = folder / ("sub_Sig.mat" if fmt == "cid" else "capture")
     path.write_bytes(blob)
     given = {key: FORMATS[fmt][1][key] for key in NEED.get(name, ())}
+    if look:
+        with no_hang(), contextlib.suppress(CaptureError):
+            detect_format(folder if fmt == "cid" else path)
     try:
         with no_hang():
             capture = read_capture(path, fmt, options=ReaderOptions(**given))  # type: ignore[arg-type]
+        with no_hang():
+            nonsense(capture)
+            if look:
+                describe(capture, fmt, examine(capture))
     except CaptureError as error:
         sentence = str(error)
         assert sentence, "nothing said"
         assert sentence.isprintable(), repr(sentence)
         return "refused"
-    with no_hang():
-        nonsense(capture)
-        if look:
-            examine(capture)
     return "read"

@@ -157,7 +157,7 @@ WORKS = (
         of_capture,
         60,
     ),
-    Work("results", results, of_results, 15),
+    Work("results", results, of_results, 50),
 )  # fmt: skip
 
 

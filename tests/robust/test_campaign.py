@@ -26,6 +26,25 @@ def test_a_table_counts_what_failed():
     assert "`x.py` at abc" in told
 
 
+def test_runs_of_one_command_are_one_line():
+    row = {
+        "part": "kills",
+        "kind": "train",
+        "kills": 3,
+        "by": {"SIGINT": 3},
+        "chains": 1,
+        "same": 1,
+        "failures": [],
+    }
+    other = row | {"kills": 2, "by": {"SIGKILL": 1, "SIGINT": 1}}
+    told = campaign.tables(
+        [made | {"commit": c, "command": "x.py"} for c, made in (("a", row), ("b", other))]
+    )
+    assert "| train | 5 (1, 4, 0) | 2 | 2 | 0 |" in told
+    assert "`x.py` at a" in told
+    assert "`x.py` at b" in told
+
+
 def test_every_part_names_a_script():
     for script, *_ in campaign.PARTS:
         assert (campaign.HERE / script).is_file()
