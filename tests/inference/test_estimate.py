@@ -16,6 +16,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.advise import plans
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
 from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Trial, Turn
 from nlos_lit.inference.evidence import UNEVENNESS, Projector
@@ -221,7 +222,9 @@ def findings():
 
     def trial(name: str, evidence: float, gain: float, weight: float) -> Trial:
         one = found_candidate(name, scan, evidence)
-        return Trial(one, final, nothing, Comparison(gain, 1.0, (gain - 2, gain + 2)), weight)
+        other = fit_of(model, measured, Extension([effect_of(name, scan), free]), split.fit)
+        fit = final if name in ("irf_tail", "free_wall") else other
+        return Trial(one, fit, nothing, Comparison(gain, 1.0, (gain - 2, gain + 2)), weight)
 
     def kept(evidence: float) -> Confirmed:
         return Confirmed(evidence, 8.0, Comparison(40.0, 1.0, (38, 42)), 1.0)
@@ -236,7 +239,7 @@ def findings():
     group = {"irf_tail": 0.6, "afterpulsing": 0.2, "free_wall": 0.2}
     turns = [
         Turn(first, 8.0, frozenset(), [won, rival, beside, control], won, group, kept(450.0), True),
-        Turn(first[1:], 8.0, frozenset(), [second], second, {"free_wall": 1.0}, kept(80.0), True),
+        Turn(first[1:], 8.0, frozenset(), [second, control], second, {"free_wall": 1.0}, kept(80.0), True),
         Turn(first[3:], 8.0),
     ]
     losses = {"irf_tail": Comparison(250.0, 5.0, (240, 260)), "free_wall": Comparison(60.0, 5.0, (50, 70))}
@@ -255,6 +258,8 @@ def test_what_is_said_of_accepted_terms(findings):
     # Six and two tenths remain when the map, which was accepted beside, is no rival, nor is none.
     assert tail.weights == pytest.approx({"irf_tail": 0.75, "afterpulsing": 0.25})
     assert tail.confusable_with == ["afterpulsing"]
+    assert set(tail.advised) == {plan.name for plan in plans(findings[1])}
+    assert free.advised == {}, "nothing else may be meant"
     assert "background" in tail.split_by
     assert said.groups == [["irf_tail", "afterpulsing"]]
     assert (tail.evidence, tail.axis, tail.shape) == (450, "", None)
