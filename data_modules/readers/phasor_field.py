@@ -86,7 +86,7 @@ def read(path: Path, options: ReaderOptions) -> Capture:
 
 def _detector(contents: Contents, rows: int, columns: int) -> tuple[int, int]:
     index = contents.read("SPAD_index").ravel()
-    if index.size != 2 or not np.array_equal(index, np.rint(index)):
+    if index.size != 2 or not np.isfinite(index).all() or not np.array_equal(index, np.rint(index)):
         raise CaptureError(
             f"SPAD_index in {contents.path.name} must be (row, column), counted from 1; found "
             f"{index[:4].tolist()}"
