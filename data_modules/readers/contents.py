@@ -205,6 +205,13 @@ class Contents:
             if dataset.shape != () or h5py.check_string_dtype(dataset.dtype) is None:
                 return ""
             self._check_size(name, self.entries[name], 1)  # a single value is never packed
+            place = dataset.id.get_offset()
+            if (
+                h5py.check_string_dtype(dataset.dtype).length is None
+                and place
+                and not heap_ends(self.path, place)
+            ):
+                raise CaptureError(f"{name} in {self.path.name} cannot be read; the file is damaged")
             return dataset[()].decode("utf-8", errors="replace")
 
     def _check_size(self, name: str, entry: Entry, packing: int = _DEFLATE_LIMIT) -> None:
@@ -367,3 +374,35 @@ def _damage(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise CaptureError(f"{path.name} is damaged or truncated ({reason})") from error
+
+
+def heap_ends(path: Path, place: int) -> bool:
+    """Whether HDF5 comes to the end of the heap in which a text of any length lies.
+
+    It goes from object to object by the lengths that stand there, and never ends where one of no length
+    follows. Addresses and lengths are taken for eight bytes long, as they are in all but very old files.
+
+    Args:
+        path: of the file.
+        place: of the text's length (4 bytes) and its heap's address (8 bytes) in the file.
+
+    Returns:
+        False where it would go on for ever, or beyond the heap.
+    """
+    with path.open("rb") as file:
+
+        def number(at: int, size: int = 8) -> int:
+            file.seek(at)
+            return int.from_bytes(file.read(size), "little")
+
+        heap, at = number(place + 4), 16
+        if not heap < path.stat().st_size:
+            return True  # of that HDF5 itself takes notice
+        size = number(heap + 8)
+        while at + 16 <= size:
+            index, length = number(heap + at, 2), number(heap + at + 8)
+            need = 16 + -(-length // 8) * 8 if index else length
+            if not 16 <= need <= size - at:
+                return False
+            at += need
+        return True
