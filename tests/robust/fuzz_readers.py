@@ -3,7 +3,7 @@
 ``python tests/robust/fuzz_readers.py OUT.jsonl format=ytal [seed=0] [runs=100000] [seconds=3600]`` adds a
 row; what fails is left in ``OUT.failures/`` and becomes, once mended, a file of ``corpus/FORMAT/``. Without
 atheris the bytes are drawn at random. The work is done in a process of its own: a file that ends it (a fault
-in a C library) is a failure, and the next process goes on.
+in a C library), or on which it stays, is a failure, and the next process goes on.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ if sys.argv[1:2] == [WORKER]:
 
 MEMORY = 3 * 2**30  # bytes of address space
 LONGEST = 80  # bytes of an input
+STUCK = 120.0  # s without another file after which a process is ended
 SHOWN = 50  # failures that are told apart
 
 
@@ -134,6 +135,18 @@ def work(fmt: str, seed: int, runs: int, until: float, place: Path) -> None:
     atheris.Fuzz()
 
 
+def watched(process: subprocess.Popen, shared: Shared, longest: float = STUCK) -> int:
+    """How a process ends; one that gets no further is ended: a C library does not heed a timer."""
+    tried, since = -1, time.time()
+    while process.poll() is None:
+        time.sleep(0.2)
+        if shared.get().tried != tried:
+            tried, since = shared.get().tried, time.time()
+        elif time.time() - since > longest:
+            process.kill()
+    return process.wait()
+
+
 def main(arguments: list[str]) -> None:
     given = dict(argument.split("=", 1) for argument in arguments[1:])
     fmt, seed, runs = given["format"], int(given.get("seed", 0)), int(given.get("runs", 100_000))
@@ -144,7 +157,7 @@ def main(arguments: list[str]) -> None:
     shared, turn = Shared(place / "came"), 0
     while shared.get().tried < runs and time.time() < until:
         asked = [WORKER, fmt, str(seed + 1000 * turn), str(runs), str(until), str(place)]
-        status = subprocess.run([sys.executable, __file__, *asked], check=False).returncode
+        status = watched(subprocess.Popen([sys.executable, __file__, *asked]), shared)
         if status:
             data = shared.get().data
             keep(place, data, f"ended by {hashlib.sha256(data).hexdigest()[:12]}, status {status}")
