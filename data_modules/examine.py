@@ -104,7 +104,11 @@ def describe(capture: Capture, fmt: str, findings: Findings) -> str:
             f"first return depth {low:.3f} / {middle:.3f} / {high:.3f} m "
             f"(5 / 50 / 95 % of {len(findings.first_returns)} spots)"
         )
-        heights, edges = np.histogram(findings.first_returns, bins=8)
+        # No finer than the bins: between equal depths there would be no room for eight rows.
+        first, last = findings.first_returns.min(), findings.first_returns.max()
+        heights, edges = np.histogram(
+            findings.first_returns, bins=8, range=(first, max(last, first + 4 * capture.bin_length))
+        )
         lines += [
             f"             {a:6.3f} m {'#' * round(40 * n / heights.max())} {n}"
             for n, a in zip(heights, edges[:-1], strict=True)

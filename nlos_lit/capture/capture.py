@@ -71,9 +71,9 @@ class Capture:
             zeros included. None means everywhere. Elsewhere ``counts`` are zero and say nothing.
 
     Raises:
-        CaptureError: shapes disagree, values are NaN, infinite or negative, coordinates are beyond 1000 km,
-            everything is zero, the exposure is no time, the gate is empty or none of its bins was recorded,
-            or counts lie in bins that were not recorded.
+        CaptureError: shapes disagree, values are NaN, infinite or negative, coordinates or the start of the
+            times are beyond 1000 km, everything is zero, the exposure is no time, the gate is empty or none
+            of its bins was recorded, or counts lie in bins that were not recorded.
 
     Examples:
         A confocal scan of 2 × 2 spots, 0.1 m apart, with 4 bins of 0.02 m:
@@ -138,8 +138,10 @@ class Capture:
                 f"bin_length must be a length in metres, {SHORTEST_BIN:g} to {LONGEST_BIN:g}; found "
                 f"{self.bin_length}"
             )
-        if not np.isfinite(self.t_start):
-            raise CaptureError(f"t_start must be finite; found {self.t_start}")
+        if not abs(self.t_start) <= FARTHEST:
+            raise CaptureError(
+                f"t_start must be a path in metres, {FARTHEST:g} at most; found {self.t_start}"
+            )
         if self.exposure_s is not None and not 0 < self.exposure_s <= LONGEST_EXPOSURE:
             raise CaptureError(
                 f"exposure_s must be a positive number of seconds, at most {LONGEST_EXPOSURE:g}; found "

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import reader_files as files
 import scipy.io
 
-from data_modules.examine import examine
+from data_modules.examine import describe, examine
 from data_modules.readers import READERS, read_capture
 from nlos_lit.commands.inspect_capture import main as inspect_capture
 
@@ -60,6 +61,14 @@ def test_depth_of_the_first_return_and_the_direct_pulse(tmp_path):
     assert findings.pulse == 0
     assert findings.pulse_share == pytest.approx(1 - 60 * 25.07 / (3000 * 40.5 + 60 * 25.07), abs=0.01)
     assert findings.warnings == ()
+
+
+def test_depths_that_are_all_but_equal_are_told(tmp_path):
+    """Between neighbouring numbers there is no room for eight rows of a histogram; in eight bins there is."""
+    capture = read_capture(_lct(tmp_path))
+    close = np.array([1e5, np.nextafter(1e5, 2e5)])
+    told = describe(capture, "lct", replace(examine(capture), first_returns=close))
+    assert told.count("#" * 40) == 1
 
 
 @pytest.mark.parametrize(
