@@ -202,15 +202,12 @@ class Contents:
             return ""
         with _damage(self.path), h5py.File(self.path, "r") as file:
             dataset = file[name]
-            if dataset.shape != () or h5py.check_string_dtype(dataset.dtype) is None:
+            kind = h5py.check_string_dtype(dataset.dtype)
+            if dataset.shape != () or kind is None:
                 return ""
             self._check_size(name, self.entries[name], 1)  # a single value is never packed
             place = dataset.id.get_offset()
-            if (
-                h5py.check_string_dtype(dataset.dtype).length is None
-                and place
-                and not heap_ends(self.path, place)
-            ):
+            if kind.length is None and place and not heap_ends(self.path, place):
                 raise CaptureError(f"{name} in {self.path.name} cannot be read; the file is damaged")
             return dataset[()].decode("utf-8", errors="replace")
 

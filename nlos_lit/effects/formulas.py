@@ -291,7 +291,7 @@ class WidthOverScan(_OverScan):
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         # Its first kernel spreads light by a bin to either side: a variance of twice its coefficient.
         assert isinstance(free, FreeResponseScan)
-        return self.order[spots], 2 * free.weights()[:, 0][spots], torch.ones(len(spots))
+        return self.order[spots], 2 * free.weights(spots)[:, 0], torch.ones(len(spots))
 
     def along(self, edges: Tensor) -> None:
         return None

@@ -263,16 +263,16 @@ class _FreeResponse(FreeTerm):
     def alone(self) -> Effect:
         return _EqualResponse(self.scan)
 
-    def weights(self) -> Tensor:
-        """``[S, 4]`` of the changes at each spot."""
-        return self.functions @ self.value("field").reshape(self.functions.shape[1], -1)
+    def weights(self, spots: Tensor | slice = slice(None)) -> Tensor:
+        """``[B, 4]`` of the changes at spots."""
+        return self.functions[spots] @ self.value("field").reshape(self.functions.shape[1], -1)
 
     def values(self) -> Tensor:
         """``[S, T]`` what becomes of light that arrives when the gate opens."""
         return self.weights() @ self.kernels[:, :, self.scan.gate[0]]
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        weights = self.weights()[spots]
+        weights = self.weights(spots)
         changed = torch.einsum("ktu,bu->bkt", self.kernels, signal)
         return (signal + torch.einsum("bk,bkt->bt", weights, changed)).clamp_min(0)
 

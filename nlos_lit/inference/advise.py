@@ -23,7 +23,6 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.evidence import Projector
 from nlos_lit.inference.problem import build_problem
-from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.fit import SurfelFit
 from nlos_lit.surfels.model import SurfelModel
 
@@ -113,8 +112,7 @@ def _seen(fit: SurfelFit, plan: Plan) -> View:
     """A fit's scene and effects in another capture."""
     model = SurfelModel.from_state(plan.of, fit.model.state_dict())
     sensor = model.laser_sensor
-    level = plan.power * sensor.intensity().item()
-    sensor.intensity = BoundedParameter(level, level * 1e-3, level * 1e3, "counts m2")
+    sensor.set_intensity(plan.power * sensor.intensity().item())
     scan = Scan.of(plan.of)
     return model, Extension([_moved(effect, scan, plan.power) for effect in fit.extension.effects])
 

@@ -18,9 +18,9 @@ from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
 from nlos_lit.inference.advise import expected_nats
 from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
-from nlos_lit.inference.distil import Follower
-from nlos_lit.inference.heldout import Comparison, score
-from nlos_lit.inference.pool import Candidate, tested_rows
+from nlos_lit.inference.distil import Follower, laid_through
+from nlos_lit.inference.heldout import Comparison, by_block, score
+from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.result import (
     Accepted,
@@ -34,7 +34,7 @@ from nlos_lit.inference.result import (
 )
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
-from nlos_lit.inference.uncertainty import Uncertainty
+from nlos_lit.inference.uncertainty import Uncertainty, uncertainty_of
 from nlos_lit.inference.witness import witness
 from nlos_lit.surfels.fit import SurfelFit
 
@@ -71,17 +71,13 @@ def assemble(
         The result, as it is written and shown.
     """
     base, final = found.base, found.final
-    rows = tested_rows(final, split, settings.spots, seed)
-    spots = split.fit[rows]
-    block = torch.from_numpy(split.block[spots])
-    share = len(rows) / len(split.fit)
 
-    def uncertainty_of(fit: SurfelFit) -> Uncertainty:
-        return Uncertainty(fit, torch.from_numpy(spots), fit.counts[rows], block, share)
+    def uncertain(fit: SurfelFit) -> Uncertainty:
+        return uncertainty_of(fit, split, settings.spots, seed)
 
-    uncertainty = uncertainty_of(final)
+    uncertainty = uncertain(final)
     terms = {e.name: e for e in final.extension.effects if isinstance(e, Free)}
-    followed = {n: _followed(f, terms[n], uncertainty_of(f.fit), scan) for n, f in followers.items()}
+    followed = {n: _followed(f, terms[n], uncertain(f.fit), scan) for n, f in followers.items()}
     accepted = [_accepted(turn, found, uncertainty, split, scan, followed) for turn in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
@@ -117,32 +113,11 @@ def assemble(
 def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Scan) -> Followed:
     formula = next(e for e in follower.fit.extension.effects if e.name == follower.name)
     assert isinstance(formula, Formula)
-    parameters, shape = uncertainty.parameters(formula, None), shape_of(free, scan)
+    parameters, shape = uncertainty.parameters(formula), shape_of(free, scan)
     curve = laid_through(formula, free, follower.fit, torch.from_numpy(shape.edges).float())
     equation = f"{formula.equation}, x {formula.is_x}"
     told = (follower.name, equation, parameters, follower.share, follower.offered)
     return Followed(*told, curve)
-
-
-@torch.no_grad()
-def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray | None:
-    """A formula at places of an axis, as high as the free term that it follows.
-
-    Args:
-        formula: of ``fit``.
-        free: the term.
-        fit: with the formula.
-        edges: ``[K]`` of the axis.
-
-    Returns:
-        ``[K]``; None where the term shows something else.
-    """
-    x = formula.along(edges)
-    if x is None:
-        return None
-    at, values, weight = formula.seen_in(free, fit.train, fit.model.expected(fit.train, fit.extension))
-    constant = (weight * (values - formula.f(at))).sum() / weight.sum()
-    return (formula.f(x) + constant).numpy()
 
 
 def _accepted(
@@ -225,9 +200,8 @@ def nats_by_block(before: Tensor, after: Tensor, split: Split) -> list[float]:
     Returns:
         One number a block.
     """
-    names, index = np.unique(split.block[split.select], return_inverse=True)
-    gain = torch.zeros(len(names), dtype=torch.float64)
-    return gain.index_add_(0, torch.from_numpy(index), (after - before).double()).tolist()
+    gain: list[float] = by_block(after - before, split.block[split.select]).tolist()
+    return gain
 
 
 def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:

@@ -332,8 +332,8 @@ class Loop:
         rivals = leaders([c for c in candidates if c.loud > bars[c.name]], s.rivals)
         if not rivals:
             return turn
-        jobs: list[Job] = [("going on without another term", None, partial(self.warm, fit, []))]
-        jobs += [(f"going on with {c.name}", c, partial(self.warm, fit, [c])) for c in rivals]
+        jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
+        jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
         return self._chosen(replace(turn, trials=trials), trials)
 
@@ -450,7 +450,7 @@ class Loop:
                     f"with {name}",
                     lambda: go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
                 ),
-                (f"without {name}", lambda: self.warm(fine, [])),
+                (f"without {name}", lambda: self._warm(fine, [])),
             )
         ]
         return found[0], found[1]
@@ -512,20 +512,20 @@ class Loop:
         number = min(len(self.split.fit), self.settings.spots)
         return max(0.0, sum(misfit_of(fit, spots, number) for spots in parts) / len(parts))
 
-    def warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
-        """The same scene, gone on with more terms.
+    def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
+        """The same scene, gone on with more terms."""
+        return go_on(fit.copy(begun_with(fit, extra), self.seed))
+
+    def without(self, fit: SurfelFit, name: str) -> SurfelFit:
+        """The same scene, gone on without a term.
 
         Args:
             fit: that is copied.
-            extra: the terms, begun where the pool saw them.
+            name: of the term.
 
         Returns:
             another fit.
         """
-        return go_on(fit.copy(begun_with(fit, extra), self.seed))
-
-    def _without(self, fit: SurfelFit, name: str) -> SurfelFit:
-        """The same scene, gone on without a term."""
         fewer = [e for e in copy_effects(fit.extension, []).effects if e.name != name]
         return go_on(fit.copy(Extension(fewer), self.seed))
 
@@ -550,8 +550,8 @@ class Loop:
         names = [e.name for e in fit.extension.effects]
         if not names:
             return {}
-        jobs = [("going on with all", "all", partial(self.warm, fit, []))]
-        jobs += [(f"going on without {n}", f"all_but_{n}", partial(self._without, fit, n)) for n in names]
+        jobs = [("going on with all", "all", partial(self._warm, fit, []))]
+        jobs += [(f"going on without {n}", f"all_but_{n}", partial(self.without, fit, n)) for n in names]
         self.steps.plan(fit=len(jobs))
         fits = self.steps.several("fit", jobs, self.settings.processes)
         whole, *fewer = [log_likelihood(f, self.split.select) for f in fits]

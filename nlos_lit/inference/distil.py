@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -18,7 +19,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import Formula, formulas_of
 from nlos_lit.effects.free_terms import Free
 from nlos_lit.inference.criticise import Findings, Loop, copy_effects, go_on
-from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
+from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.surfels.fit import SurfelFit
 
 TRIED = 3  # formulas with which the scene goes on
@@ -32,13 +33,11 @@ class Follower:
     Args:
         name: of the formula.
         fit: the scene with it in place of the free term.
-        gain: on the select spots, over going on with neither.
-        share: of the free term's own gain there.
+        share: of the free term's own gain on the select spots that it keeps.
     """
 
     name: str
     fit: SurfelFit
-    gain: Comparison
     share: float
 
     @property
@@ -60,44 +59,40 @@ def distil(loop: Loop, found: Findings) -> dict[str, Follower]:
     followers = {}
     for turn in found.accepted:
         assert turn.best is not None
-        follower = _of_term(loop, found.final, turn.best.name)
+        name = turn.best.name
+        follower = _of_term(loop, found.final, name, found.losses[name].nats)
         if follower is not None:
-            followers[turn.best.name] = follower
+            followers[name] = follower
     return followers
 
 
-def _of_term(loop: Loop, final: SurfelFit, name: str) -> Follower | None:
-    formulas, s, spots = formulas_of(name), loop.settings, loop.split.select
-    if not formulas:
+def _of_term(loop: Loop, final: SurfelFit, name: str, gain: float) -> Follower | None:
+    """The one of a term whose own gain is that."""
+    formulas, spots = formulas_of(name), loop.split.select
+    if not formulas or gain <= 0:
         return None
     free = next(e for e in final.extension.effects if e.name == name)
     assert isinstance(free, Free)
     expected = final.model.expected(final.train, final.extension)
     laid = [lay(formula(loop.scan), free, final.train, expected) for formula in formulas]
     tried = [formula for _, formula in sorted(laid, key=lambda pair: pair[0])][:TRIED]
-    left = [e for e in copy_effects(final.extension, []).effects if e.name != name]
-    bare = final.copy(Extension(left), loop.seed)
 
     def with_it(formula: Formula) -> SurfelFit:
-        fit = bare.copy(copy_effects(bare.extension, [formula]), loop.seed)
+        effects = [e for e in final.extension.effects if e.name != name]
+        fit = final.copy(copy_effects(Extension(effects), [formula]), loop.seed)
         fit.match_energy()  # a constant is none of a formula's, and may have been of the term's
         return go_on(fit)
 
-    jobs = [
-        ("going on with all", "all", partial(loop.warm, final, [])),
-        (f"going on without {name}", f"all_but_{name}", partial(loop.warm, bare, [])),
-    ]
+    jobs = [(f"going on without {name}", f"all_but_{name}", partial(loop.without, final, name))]
     for formula in tried:
         text, kept = f"going on with {formula.name}", f"{formula.name}_for_{name}"
         jobs.append((text, kept, partial(with_it, formula)))
     loop.steps.plan(fit=len(jobs))
-    fits = loop.steps.several("fit", jobs, s.processes)
-    whole, neither, *values = [log_likelihood(fit, spots) for fit in fits]
-    best = max(range(len(tried)), key=lambda k: float(values[k].sum()))
-    term, gain = (compare(neither, value, loop.block) for value in (whole, values[best]))
-    if term.nats <= 0:
-        return None
-    return Follower(tried[best].name, fits[2 + best], gain, gain.nats / term.nats)
+    neither, *fits = loop.steps.several("fit", jobs, loop.settings.processes)
+    values = [float(log_likelihood(fit, spots).sum()) for fit in fits]
+    best = max(range(len(tried)), key=lambda k: values[k])
+    kept_of_it = (values[best] - float(log_likelihood(neither, spots).sum())) / gain
+    return Follower(tried[best].name, fits[best], kept_of_it)
 
 
 @torch.no_grad()
@@ -131,3 +126,24 @@ def lay(formula: Formula, free: Free, spots: Tensor, expected: Tensor) -> tuple[
     for p, value in zip(formula.amplitudes, amplitudes.tolist(), strict=True):
         formula.set(p.name, value)
     return least, formula
+
+
+@torch.no_grad()
+def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray | None:
+    """A formula at places of an axis, as high as the free term that it follows.
+
+    Args:
+        formula: of ``fit``.
+        free: the term.
+        fit: with the formula.
+        edges: ``[K]`` of the axis.
+
+    Returns:
+        ``[K]``; None where the term shows something else.
+    """
+    x = formula.along(edges)
+    if x is None:
+        return None
+    at, values, weight = formula.seen_in(free, fit.train, fit.model.expected(fit.train, fit.extension))
+    constant = (weight * (values - formula.f(at))).sum() / weight.sum()
+    return (formula.f(x) + constant).numpy()

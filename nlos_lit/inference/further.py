@@ -28,11 +28,11 @@ from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings, begun_with, copy_effects, go_on, solve_spots
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.heldout import log_likelihood, weights
-from nlos_lit.inference.pool import Candidate, ask, lit_by, tested_rows
+from nlos_lit.inference.pool import Candidate, ask, lit_by
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Further, Tried
 from nlos_lit.inference.split import Split
-from nlos_lit.inference.uncertainty import Uncertainty
+from nlos_lit.inference.uncertainty import uncertainty_of
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
 
@@ -190,11 +190,8 @@ class _Asking:
         return self.steps("fit", f"going on with {name}", name, partial(go_on, fit))
 
     def _parameters(self, fit: SurfelFit, name: str) -> dict[str, Estimate]:
-        rows = tested_rows(fit, self.split, self.options.spots, self.seed)
-        spots = self.split.fit[rows]
-        given = (torch.from_numpy(spots), fit.counts[rows], torch.from_numpy(self.split.block[spots]))
         effect = next(e for e in fit.extension.effects if e.name == name)
-        return Uncertainty(fit, *given, len(rows) / len(self.split.fit)).parameters(effect)
+        return uncertainty_of(fit, self.split, self.options.spots, self.seed).parameters(effect)
 
 
 def _weights(tried: Mapping[str, Tried]) -> dict[str, float]:

@@ -56,6 +56,26 @@ def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
     return value
 
 
+def by_block(values: Tensor, block: np.ndarray) -> np.ndarray:
+    """Sums over wall blocks.
+
+    Args:
+        values: ``[S, …]`` of spots.
+        block: ``[S]`` wall block of each.
+
+    Returns:
+        ``[B, …]`` in double precision, by rising block.
+
+    Examples:
+        >>> by_block(torch.tensor([1.0, 2.0, 4.0]), np.array([7, 3, 7])).tolist()
+        [2.0, 5.0]
+    """
+    names, index = np.unique(block, return_inverse=True)
+    total = np.zeros((len(names), *values.shape[1:]))
+    np.add.at(total, index, values.numpy())
+    return total
+
+
 def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> Comparison:
     """Paired comparison of log-likelihoods of the same spots.
 
@@ -73,10 +93,8 @@ def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> 
         >>> found.nats, found.error
         (6.0, 0.0)
     """
-    names, index = np.unique(block, return_inverse=True)
-    gain = np.zeros(len(names))
-    np.add.at(gain, index, (after - before).numpy())
-    draws = np.random.default_rng(seed).integers(len(names), size=(BOOTSTRAP, len(names)))
+    gain = by_block(after - before, block)
+    draws = np.random.default_rng(seed).integers(len(gain), size=(BOOTSTRAP, len(gain)))
     sums = gain[draws].sum(1)
     low, high = np.quantile(sums, (0.025, 0.975))
     return Comparison(float(gain.sum()), float(sums.std(ddof=1)), (float(low), float(high)))
@@ -101,10 +119,8 @@ def weights(likelihoods: Sequence[Tensor], block: np.ndarray, seed: int = 0) -> 
         >>> [round(w, 2) for w in weights([same, same - 9], np.array([0, 0, 1, 1]))]
         [1.0, 0.0]
     """
-    names, index = np.unique(block, return_inverse=True)
-    table = np.zeros((len(names), len(likelihoods)))
-    np.add.at(table, index, torch.stack(list(likelihoods), 1).numpy())
-    drawn = len(names) * np.random.default_rng(seed).dirichlet(np.ones(len(names)), BOOTSTRAP) @ table
+    table = by_block(torch.stack(list(likelihoods), 1), block)
+    drawn = len(table) * np.random.default_rng(seed).dirichlet(np.ones(len(table)), BOOTSTRAP) @ table
     shares = np.exp(drawn - drawn.max(1, keepdims=True))
     return (shares / shares.sum(1, keepdims=True)).mean(0).tolist()
 

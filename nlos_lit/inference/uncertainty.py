@@ -10,9 +10,10 @@ from torch import Tensor
 
 from nlos_lit.effects.effect import Effect
 from nlos_lit.inference.evidence import Projector
-from nlos_lit.inference.pool import patches_for
+from nlos_lit.inference.pool import patches_for, tested_rows
 from nlos_lit.inference.problem import build_problem, weighted_columns
 from nlos_lit.inference.result import Estimate
+from nlos_lit.inference.split import Split
 from nlos_lit.surfels.fit import SurfelFit
 
 REACH = 3.0  # standard errors over which quantities are displaced
@@ -96,6 +97,24 @@ def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
     moved = copy.deepcopy(effect)
     moved.shift(step, shapes=True)
     return _values(moved)
+
+
+def uncertainty_of(fit: SurfelFit, split: Split, most: int, seed: int) -> Uncertainty:
+    """That of a fit's effects, from the spots that the pool is asked on.
+
+    Args:
+        fit: with the effects.
+        split: of its spots.
+        most: spots, at most.
+        seed: of their choice.
+
+    Returns:
+        for all of the fitted spots.
+    """
+    rows = tested_rows(fit, split, most, seed)
+    spots = split.fit[rows]
+    block = torch.from_numpy(split.block[spots])
+    return Uncertainty(fit, torch.from_numpy(spots), fit.counts[rows], block, len(rows) / len(split.fit))
 
 
 def _values(effect: Effect) -> dict[str, float]:

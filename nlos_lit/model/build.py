@@ -212,8 +212,4 @@ def match_energy(pipeline: Pipeline, capture: Capture, spots: torch.Tensor) -> N
             "or check scene.volume.depth and the wall size"
         )
     excess = ((measured - background) * seen).sum().clamp_min(1e-3 * measured.sum())
-    old = sensor.intensity
-    value = float(excess / rendered)
-    sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, old.unit).to(
-        rendering.expected.device
-    )
+    sensor.set_intensity(float(excess / rendered))

@@ -69,6 +69,16 @@ class LaserSensor(nn.Module):
         tail = math.log(1e5) / (kappa_s.lower * bin_length) + 5 * sigma_ls.upper / bin_length
         self.length = self.lead + min(n_bins, 2 + math.ceil(tail))
 
+    def set_intensity(self, value: float) -> None:
+        """Begin I_l anew at a value, from a thousandth to a thousand times of which it may go.
+
+        Args:
+            value: > 0, in the present unit.
+        """
+        old = self.intensity
+        device = next(old.parameters()).device
+        self.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, old.unit).to(device)
+
     def kernel(self) -> Tensor:
         """Share Ψ/I_l ``[length]`` of a path's energy per bin, bin ``lead`` centred on its arrival."""
         sigma = self.sigma_ls() / self.bin_length

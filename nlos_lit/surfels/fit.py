@@ -18,7 +18,6 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import Sheet
 from nlos_lit.metrics.transients import transient_scores
-from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
@@ -347,7 +346,7 @@ class SurfelFit:
             float((counted - dark).clamp_min(0.01 * counted) / light.clamp_min(1e-30))
             * sensor.intensity().item()
         )
-        sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
+        sensor.set_intensity(value)
 
     def schedule(self, plan: Sequence[Round], more: int = 0, lay: bool = False) -> None:
         """Say what is to be done next; it takes the place of what was.

@@ -140,6 +140,5 @@ def normalise_albedo(model: SurfelModel) -> None:
     albedo = model.albedo()
     white = float(torch.quantile(albedo, 0.98))
     sensor = model.laser_sensor
-    value = sensor.intensity().item() * white
-    sensor.intensity = BoundedParameter(value, value * 1e-3, value * 1e3, "counts m2")
+    sensor.set_intensity(sensor.intensity().item() * white)
     model.set_albedo(albedo / white)
