@@ -150,6 +150,7 @@ def _accepted(
         shape=shape_of(free, scan) if free else None,
         formula=followed.get(effect.name),
         needed=confirmed.needed,
+        explained=confirmed.explained,
         tried={name: _tried(name, turn.trials, split) for name in weights},
     )
 

@@ -108,12 +108,14 @@ class Confirmed:
         needed: nats.
         gain: of the select spots over the scene that grew without it.
         weight: how far the capture leaves open that it predicts better than that one.
+        explained: share of what the select spots leave unexplained without it; asked in company only.
     """
 
     evidence: float
     needed: float
     gain: Comparison
     weight: float
+    explained: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -435,9 +437,10 @@ class Loop:
             evidence, least = self._own(turn, scene, f"{kept}_own_{name}")
             before = log_likelihood(fit, select)
             gain, weight = compare(before, value, self.block), weights([before, value], self.block)[1]
-            explained = gain.nats > PREDICTED * misfit_of(fit, select, len(select))
-            yes = (evidence > least or explained) and weight > 1 - self.settings.open_share
-            found.append(replace(turn, confirmed=Confirmed(evidence, least, gain, weight), accepted=yes))
+            explained = gain.nats / max(misfit_of(fit, select, len(select)), gain.nats, 1e-9)
+            yes = (evidence > least or explained > PREDICTED) and weight > 1 - self.settings.open_share
+            confirmed = Confirmed(evidence, least, gain, weight, explained)
+            found.append(replace(turn, confirmed=confirmed, accepted=yes))
         return found
 
     def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:

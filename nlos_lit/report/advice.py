@@ -63,19 +63,16 @@ def confidence(diagnosis: Diagnosis) -> str:
     several = len(terms) > 1
     it = "each of them" if several else "it"
     held = all(term.heldout_gain.ci95[0] > 0 for term in terms)
+    asked = f"the counts ask for {it} by more than is needed"
+    if not all(term.asked_for for term in terms):
+        asked += ", or it explains much of what is wrong elsewhere on the wall"
     if any(rivals(diagnosis, term) for term in terms):
         first = "Open: that something is there is " + ("well supported" if held else "likely")
         text = f"{first}, but what it is this capture cannot tell: more than one cause would look like this."
     elif held:
-        text = (
-            f"Good: the counts ask for {it} by more than is needed, and {it} also predicts parts of the wall"
-            " that nothing was fitted to."
-        )
+        text = f"Good: {asked}, and {it} also predicts parts of the wall that nothing was fitted to."
     else:
-        text = (
-            f"Fair: the counts ask for {it} by more than is needed; that {it} predicts other parts of the"
-            " wall better may still be chance."
-        )
+        text = f"Fair: {asked}; that {it} predicts other parts of the wall better may still be chance."
     if not diagnosis.toys:
         text += " How often as much comes up by itself was not counted here: criticism.toys=20 counts it."
     return text
@@ -160,11 +157,11 @@ def told_turn(count: int, turn: Turn) -> str:
     if turn.best is None:
         return f"Turn {count}: nothing more is asked for."
     phrase, found = describe(turn.best.name).phrase, turn.confirmed
-    nats = (
-        ""
-        if found is None
-        else f" ({number(found.evidence)} nats beside a fine scene, {number(found.needed)} needed)"
-    )
+    nats = ""
+    if found is not None and turn.accepted and found.evidence < found.needed:
+        nats = f" ({percent(found.explained)} of what other spots leave unexplained without it)"
+    elif found is not None:
+        nats = f" ({number(found.evidence)} nats beside a fine scene, {number(found.needed)} needed)"
     verb = "the simulation was extended by" if turn.accepted else "not confirmed:"
     return f"Turn {count}: {verb} {phrase}{nats}."
 
