@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import hydra
+from hydra._internal import utils
 from omegaconf import DictConfig
 
 from nlos_lit.commands.plan import plan
@@ -42,5 +44,17 @@ def compose_and_run(
             plan(config)
             return task(config)
 
-    hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)()
+    with hydra_in_sentences():
+        hydra.main(version_base="1.3", config_path=str(CONF), config_name=name)(run)()
     return 0
+
+
+@contextmanager
+def hydra_in_sentences() -> Iterator[None]:
+    """What the disk refuses to Hydra itself, which writes a config and a log before the command begins."""
+    report = utils.run_and_report
+    utils.run_and_report = lambda func: report(sentence_errors(func))
+    try:
+        yield
+    finally:
+        utils.run_and_report = report

@@ -42,7 +42,7 @@ def origin_of(settings: Mapping[str, Any], capture: Capture) -> dict[str, Any]:
     shaping = {name: settings[name] for name in sections}
     if isinstance(shaping["effects"], str):
         shaping["effects"] = [shaping["effects"]]
-    return {"capture": capture.digest(), "settings": _flat(shaping), "changed": []}
+    return {"capture": capture.digest(), "settings": flat(shaping), "changed": []}
 
 
 def check_origin(
@@ -159,9 +159,17 @@ def finished_checkpoint(folder: Path) -> Path:
     return file
 
 
-def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name."""
+def flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name.
+
+    Args:
+        values: of a section.
+        above: its own name, with a dot behind.
+
+    Returns:
+        name → what is no section.
+    """
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= _flat(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
+        found |= flat(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
     return found
