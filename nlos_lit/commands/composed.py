@@ -53,7 +53,16 @@ def compose_and_run(
 def hydra_in_sentences() -> Iterator[None]:
     """What the disk refuses to Hydra itself, which writes a config and a log before the command begins."""
     report = utils.run_and_report
-    utils.run_and_report = lambda func: report(sentence_errors(func))
+
+    def told(func: Callable[[], Any]) -> Any:
+        try:
+            return func()
+        except ValueError as error:  # logging's word for a file that it cannot open
+            if isinstance(error.__cause__, OSError):
+                raise error.__cause__ from None
+            raise
+
+    utils.run_and_report = lambda func: report(lambda: sentence_errors(told)(func))
     try:
         yield
     finally:

@@ -94,11 +94,12 @@ def test_what_the_disk_refuses_is_one_sentence_with_the_file(tmp_path, capsys, c
     assert line.startswith(f"error: {tmp_path}/volume.h5: {os.strerror(code)}; ")
 
 
-def test_a_disk_that_is_full_when_hydra_writes_is_one_sentence(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("where", ["hydra.core.utils._save_config", "logging.FileHandler._open"])
+def test_a_disk_that_is_full_when_hydra_writes_is_one_sentence(tmp_path, monkeypatch, capsys, where):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("hydra.core.utils._save_config", full)
+    monkeypatch.setattr(where, full)
     monkeypatch.setattr("sys.argv", ["reconstruct.py"])
     with pytest.raises(SystemExit) as end:
         compose_and_run(
