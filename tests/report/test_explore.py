@@ -116,6 +116,21 @@ def test_the_command_opens_no_page_of_a_stranger(tmp_path):
     assert "stranger" not in command.page_of(tmp_path).read_text(encoding="utf-8")
 
 
+def test_an_effect_that_came_with_a_folder_is_not_run(tmp_path):
+    write_view(tmp_path / "diagnosis", view())
+    for name in ("effects/irf_tail.py", "effects/__init__.py", "numpy.py"):
+        file = tmp_path / "diagnosis" / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "view.py"), str(tmp_path), "--no-open"],
+        cwd=tmp_path / "diagnosis", env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "ran").exists()
+
+
 @pytest.mark.parametrize(
     "facts",
     [{"status": "x"}, {"said": [3]}, {"said": None}, {"profiles": [4]}, {"tone": 3}, {"at": "\ud800"}],
