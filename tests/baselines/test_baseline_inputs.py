@@ -195,6 +195,6 @@ def test_a_volume_that_has_left_the_numbers_is_no_result(method):
     counts = capture.counts.astype(np.float32)
     counts[3, 60] = 3e38
     broken = dataclasses.replace(capture, counts=counts, is_counts=False)
-    told = pytest.raises(CaptureError, match=r"left the numbers \(NaN or infinite voxels\), which is no result")
+    told = pytest.raises(CaptureError, match=r"has left the numbers \(NaN or infinite voxels\), which is no")
     with told if method == "lct" else contextlib.suppress(CaptureError):
         assert torch.isfinite(reconstruct(broken, GRID, method)).all()
