@@ -211,6 +211,12 @@ def reader_options(reader: Mapping[str, Any]) -> ReaderOptions:
 
 
 def _simulate(plan: Mapping[str, Any], seed: int) -> tuple[Capture, SurfaceTruth]:
+    lacking = [name for name in ("mesh", "scan", "sensor") if name not in plan]
+    if lacking:
+        raise UserError(
+            f"scene.simulate lacks {' and '.join(lacking)}: leave it out for a scene that comes from a file, "
+            "or take scene=default"
+        )
     mesh = plan["mesh"]
     if mesh not in SCENES:
         raise UserError(f"no procedural scene is called {mesh!r}; there are {', '.join(SCENES)}")

@@ -19,7 +19,7 @@ from nlos_lit.baselines.light_cone import lct, lct_bytes
 from nlos_lit.baselines.migration import fk, fk_bytes
 from nlos_lit.baselines.rsd import rsd, rsd_bytes
 from nlos_lit.capture import Capture
-from nlos_lit.capture.errors import MemoryBudgetError, UserError
+from nlos_lit.capture.errors import CaptureError, MemoryBudgetError, UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 
 METHODS: dict[str, Callable[..., torch.Tensor]] = {
@@ -59,7 +59,8 @@ def reconstruct(
 
     Raises:
         UserError: unknown method or option.
-        CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
+        CaptureError: the method cannot work on this capture, the volume lies outside its gate, or it came out
+            NaN or infinite.
         MemoryBudgetError: the estimate is above the budget; nothing was allocated.
 
     Examples:
@@ -73,8 +74,7 @@ def reconstruct(
         Traceback (most recent call last):
         nlos_lit.capture.errors.CaptureError: lct needs a confocal scan on a regular planar grid; ...
     """
-    function = _checked(capture, grid, method, budget_bytes, options)
-    return function(capture, grid, **options)
+    return reconstruct_directed(capture, grid, method, budget_bytes=budget_bytes, **options)[0]
 
 
 def reconstruct_directed(
@@ -95,14 +95,19 @@ def reconstruct_directed(
 
     Raises:
         UserError: unknown method or option.
-        CaptureError: the method cannot work on this capture, or the volume lies outside its gate.
+        CaptureError: the method cannot work on this capture, the volume lies outside its gate, or it came out
+            NaN or infinite.
         MemoryBudgetError: the estimate is above the budget; nothing was allocated.
     """
     function = _checked(capture, grid, method, budget_bytes, options)
-    if method not in FIELDS:
-        return function(capture, grid, **options), None
-    field = FIELDS[method](capture, grid, **options)
-    return directed_volume(field), field
+    field = FIELDS[method](capture, grid, **options) if method in FIELDS else None
+    volume = function(capture, grid, **options) if field is None else directed_volume(field)
+    if not torch.isfinite(volume).all():
+        raise CaptureError(
+            f"method {method} has left the numbers (NaN or infinite voxels), which is no result: look for "
+            "damaged values in the capture"
+        )
+    return volume, field
 
 
 def _checked(

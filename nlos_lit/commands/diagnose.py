@@ -18,12 +18,10 @@ from omegaconf import DictConfig
 from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
 from nlos_lit.commands.composed import compose_and_run
-from nlos_lit.commands.split_with import second_capture, split_with
+from nlos_lit.commands.split_with import check_told, second_capture, split_with
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose as diagnose_capture
 from nlos_lit.inference.diagnose import split_of
-from nlos_lit.inference.further import open_terms
-from nlos_lit.inference.result import Diagnosis
 from nlos_lit.report.diagnosis_figures import diagnosis_figures
 from nlos_lit.report.page import log_figures, write_report
 from nlos_lit.report.verdict import verdict
@@ -79,7 +77,7 @@ def diagnose(config: DictConfig) -> None:
         again = config.run is not None and done.exists()
         if again:
             claim(folder)
-            open_terms(Diagnosis.read(done))
+            check_told(done.parent)
         # What cannot be read is told before the first capture takes its time.
         second = second_capture(settings, None if config.run is None else folder)
         if not again:

@@ -12,6 +12,8 @@ from nlos_lit.capture.errors import UserError, printable
 from nlos_lit.report.capture_figure import draw_capture
 from nlos_lit.runtime.command_line import typed
 
+LONGEST = 60  # characters of a capture's name that its picture's keeps: file names have room for 255 bytes
+
 
 def main(arguments: list[str]) -> int:
     """Print what the file named by ``arguments`` holds, draw it, and return the exit status."""
@@ -24,13 +26,13 @@ def main(arguments: list[str]) -> int:
         capture = read_capture(path, fmt, options=options)
         findings = examine(capture)
         print(printable(describe(capture, detect_format(path) if fmt == "auto" else fmt, findings)))
-        picture = out / f"{path.stem}_capture.png"
+        picture = out / f"{path.stem[:LONGEST]}_capture.png"
         try:
             out.mkdir(parents=True, exist_ok=True)
             draw_capture(capture, findings.mean, findings.totals, picture)
         except OSError as error:
             raise UserError(f"cannot write {picture}: {error.strerror or error}") from error
-        print(f"picture      {picture}")
+        print(printable(f"picture      {picture}"))
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

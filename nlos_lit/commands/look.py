@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import shlex
 import sys
 import time
@@ -51,7 +52,7 @@ def look(arguments: list[str]) -> None:
         UserError: there is no file, it cannot be used, or a setting does not exist.
     """
     given = [word for word in arguments if not word.startswith("out=")]
-    if not given or "=" in given[0]:
+    if not given or ("=" in given[0] and not os.path.exists(given[0])):
         raise UserError(
             f"name a capture file: {typed('look')} FILE; found {' '.join(arguments) or 'nothing'}"
         )
@@ -69,8 +70,8 @@ def look(arguments: list[str]) -> None:
         views = [View(f"{METHODS[p.method]}, {p.seconds:.1f} s", p.values, p.grid) for p in pictures]
         figure = front_views(views, threshold=pictures[0].threshold, title=measured.name)
         save_figure(figure, folder / "look.png")
-        print(f"pictures     {folder / 'look.png'}")
-    print(f"capture      {folder / 'capture.png'}")
+        print(printable(f"pictures     {folder / 'look.png'}"))
+    print(printable(f"capture      {folder / 'capture.png'}"))
     for line in following(measured):
         print(line)
 

@@ -14,16 +14,22 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import split_of
-from nlos_lit.inference.further import ask_further
+from nlos_lit.inference.further import ask_further, open_terms
 from nlos_lit.inference.result import Diagnosis
-from nlos_lit.report.page import write_report
+from nlos_lit.io.views import read_view
+from nlos_lit.report.explore import page_html
+from nlos_lit.report.page import report_html, write_report
 from nlos_lit.report.together import told_apart
 from nlos_lit.report.verdict import verdict
+from nlos_lit.runtime.arguments import check_values
 from nlos_lit.runtime.progress import StepTicker
 from nlos_lit.training.configs import pipeline_of, settings_of
 from nlos_lit.training.folder import file_name, plain_yaml
+from nlos_lit.training.origin import flat
 from nlos_lit.training.watched import retell
 
+# Of the first capture's scene: not those of the second.
+GIVEN_ANEW = ("scene.source", "scene.simulate", "scene.truth", "scene.path", "scene.name")
 log = logging.getLogger(__name__)
 
 
@@ -57,8 +63,8 @@ def second_capture(settings: dict[str, Any], folder: Path | None) -> Second:
         UserError: it cannot be read, or not be diagnosed.
     """
     kept = settings if folder is None else plain_yaml(folder / "config.yaml")
-    if not all(isinstance(kept.get(name), dict) for name in ("scene", "model")):
-        raise UserError(f"{folder} holds no config of a run: config.yaml lacks its scene or its model")
+    if folder is not None:
+        check_kept(kept, settings, folder)
     scene, now = OmegaConf.create(kept["scene"]), OmegaConf.create({"scene": settings["scene"]})
     for item in HydraConfig.get().overrides.task:
         key = item.partition("=")[0]
@@ -72,6 +78,49 @@ def second_capture(settings: dict[str, Any], folder: Path | None) -> Second:
     capture = load_scene(planned, settings["data_dir"], settings["seed"], settings["force"], raw)[0]
     split_of(capture)
     return Second(planned, kept["model"], capture)
+
+
+def check_told(folder: Path) -> None:
+    """See that a diagnosis, which may come from anywhere, leaves names open and can be told again.
+
+    Args:
+        folder: with ``diagnosis.json``, and the view of it.
+
+    Raises:
+        UserError: it leaves none open, or was altered.
+    """
+    diagnosis = Diagnosis.read(folder / "diagnosis.json")
+    open_terms(diagnosis)
+    try:
+        report_html(diagnosis, {})
+        page_html(read_view(folder))
+    except UserError:
+        raise
+    except Exception as error:  # a foreign file may be wrong in any way
+        raise UserError(f"the diagnosis in {folder} was altered; diagnose the capture again") from error
+
+
+def check_kept(kept: dict[str, Any], settings: dict[str, Any], folder: Path) -> None:
+    """See that a run's config, which may come from anywhere, holds a scene and a model.
+
+    Args:
+        kept: that config.
+        settings: of this command, resolved.
+        folder: of the run, for error messages.
+
+    Raises:
+        UserError: it does not, or values that cannot be.
+    """
+    if not all(isinstance(kept.get(name), dict) for name in ("scene", "model")):
+        raise UserError(f"{folder} holds no config of a run: config.yaml lacks its scene or its model")
+    wanted, found = (flat({"scene": config["scene"]}).keys() for config in (settings, kept))
+    missing = sorted(name for name in wanted - found if not name.startswith(GIVEN_ANEW))
+    if missing:
+        raise UserError(f"{folder}/config.yaml was altered, or is of another version: it lacks {missing[0]}")
+    try:
+        check_values("diagnose", {name: kept[name] for name in ("scene", "model")})
+    except UserError as error:
+        raise UserError(f"{folder}/config.yaml: {error}") from error
 
 
 def split_with(settings: dict[str, Any], folder: Path, second: Second, given: list[str]) -> None:

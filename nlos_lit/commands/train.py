@@ -90,6 +90,11 @@ def train(config: DictConfig) -> float | None:
     alone = config.fit == "surface"
     if alone and config.run is not None:
         config.model = run_config(config.run)["model"]  # the image is formed as it was there
+    if config.resume.change and (alone or config.ckpt_path is None):
+        raise UserError(
+            "resume.change names what a self-calibration does otherwise while it goes on: give it with "
+            "resume=FOLDER, or leave it out"
+        )
     place = "refined/checkpoints" if alone else "checkpoints"
     checkpoint = find_checkpoint(config.ckpt_path, folder, config.scene.name, place)
     config.folder = str(folder)
@@ -127,7 +132,13 @@ def _self_calibration(
     trainer = make_trainer(settings)
     history = callback_of(trainer, History)
     callback_of(trainer, ScoreHeldout)
-    run = prepare_run(settings, device_of(settings), field_shards(settings), opened(checkpoint, IMAGE))
+    run = prepare_run(
+        settings,
+        device_of(settings),
+        field_shards(settings),
+        opened(checkpoint, IMAGE),
+        change=settings["resume"]["change"],
+    )
     if trainer.is_global_zero:
         check_disk(folder, run_disk_bytes(run.module.pipeline.phasor.grid.n_voxels), "this run")
         begin_training(settings, folder, checkpoint)

@@ -4,34 +4,33 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 
-from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.errors import UserError, printable
 from nlos_lit.io.views import FILE as VIEW
 from nlos_lit.io.views import read_view
 from nlos_lit.runtime.claim import claim, refuse_links
-from nlos_lit.runtime.command_line import typed
+from nlos_lit.runtime.command_line import REFUSED, sentence_errors, typed
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Open the page of the folder that ``arguments`` (or the command line's) name; return the exit status."""
     given = parse(sys.argv[1:] if arguments is None else arguments)
-    try:
-        page = page_of(given.run)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    print(page)
+    page = sentence_errors(page_of)(given.run)
+    print(printable(str(page)))
     if given.open and not webbrowser.open(page.resolve().as_uri()):
         print("no browser was found here: open that file in one", file=sys.stderr)
     return 0
 
 
 def page_of(run: Path) -> Path:
-    """The page of a run's folder, made again where it is missing.
+    """The page of a run's folder, made anew: what opens is never a page that came with a foreign folder.
 
     Where the run says that it goes on but no process holds its folder, the page says that it was stopped.
+    Where nothing can be written to the folder, the page lies among temporary files.
 
     Args:
         run: folder of a run, of a diagnosis, or of a run that was diagnosed: the diagnosis is shown then.
@@ -44,16 +43,26 @@ def page_of(run: Path) -> Path:
     """
     from nlos_lit.report.explore import FILE as PAGE  # after the arguments: it loads torch
     from nlos_lit.report.explore import write_page
-    from nlos_lit.training.explored import mark_interrupted
+    from nlos_lit.training.explored import keep
 
     refuse_links(run)
     folder = run / "diagnosis" if (run / "diagnosis" / VIEW).is_file() else run
     view = read_view(folder)
-    if view.facts["status"] == "running" and not _held(folder):
-        mark_interrupted(folder)
-    elif not (folder / PAGE).is_file():
-        write_page(folder, view)
-    return folder / PAGE
+    try:
+        if view.facts["status"] != "running":
+            return write_page(folder, view)
+        if _held(folder):
+            return folder / PAGE  # which that process writes
+        view = replace(view, facts={**view.facts, "status": "interrupted"})
+        return keep(folder, view)
+    except UserError:
+        raise
+    except OSError as error:
+        if error.errno not in REFUSED:
+            raise
+        return write_page(tempfile.mkdtemp(prefix="nlos-view-"), view)
+    except Exception as error:  # a foreign file may be wrong in any way
+        raise UserError(f"{folder / VIEW} is damaged: {error}") from error
 
 
 def parse(arguments: list[str]) -> argparse.Namespace:

@@ -8,6 +8,7 @@ no map of the wall.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,8 +51,9 @@ def open_terms(diagnosis: Diagnosis) -> list[Accepted]:
         At least one.
 
     Raises:
-        UserError: there is none, or it was written before groups were kept with what they gained.
+        UserError: there is none, or it was written before groups were kept with what they gained, or altered.
     """
+    _check(diagnosis)
     found = [term for term in diagnosis.effects if term.confusable_with]
     if not found:
         raise UserError(
@@ -62,6 +64,34 @@ def open_terms(diagnosis: Diagnosis) -> list[Accepted]:
     if any(set(term.weights) - set(term.tried) for term in found):
         raise UserError("this diagnosis is of an earlier version; diagnose the first capture again")
     return found
+
+
+def _check(diagnosis: Diagnosis) -> None:
+    """See that the terms of a diagnosis, which may come from anywhere, are such as there are.
+
+    Raises:
+        UserError: they are not.
+    """
+    known = {cls.name for cls in [*EFFECTS, *FREE]}
+    wall = diagnosis.capture.get("wall", [0.0] * 4)
+    fine = isinstance(wall, list) and len(wall) == 4 and _numbers(wall)
+    for term in [*diagnosis.effects, *diagnosis.unknown]:
+        strange = sorted({term.name, *term.weights, *term.tried} - known)
+        if strange:
+            raise UserError(
+                f"the diagnosis names {strange[0]!r}, which is no effect of this version; diagnose the first "
+                "capture again"
+            )
+        blocks = {len(one.nats) for one in term.tried.values()}
+        fine &= len(blocks) <= 1 and 0 not in blocks
+        fine &= all(_numbers(one.nats) for one in term.tried.values())
+        fine &= all(_numbers(given) for one in term.tried.values() for given in one.values.values())
+    if not fine:
+        raise UserError("the numbers of the diagnosis were altered; diagnose the first capture again")
+
+
+def _numbers(values: list[Any]) -> bool:
+    return all(isinstance(value, int | float) and math.isfinite(value) for value in values)
 
 
 def ask_further(
@@ -209,11 +239,11 @@ def _effect(name: str, scan: Scan, values: Mapping[str, list[float]]) -> Effect:
     """An effect with values that stay as they are, or at its null where there are none.
 
     Raises:
-        UserError: the other scan gives it other coefficients.
+        UserError: the other scan gives it other coefficients, or it has none of that name.
     """
     effect = next(cls for cls in [*EFFECTS, *FREE] if cls.name == name)(scan)
     for parameter, given in values.items():
-        if len(given) != effect.declared[parameter].size:
+        if parameter not in effect.declared or len(given) != effect.declared[parameter].size:
             raise UserError(f"the scans are too different: {name} has other coefficients in the second")
         effect.set(parameter, torch.tensor(given))
     return effect.requires_grad_(not values and not effect.per_spot)

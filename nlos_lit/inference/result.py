@@ -291,4 +291,6 @@ def _made(kind: Any, value: Any) -> Any:
         return np.array(value, dtype=np.float64)
     if kind is float:
         return math.nan if value is None else float(value)
+    if kind is not Any and isinstance(kind, type) and not isinstance(value, kind):
+        raise TypeError(f"{value!r} is no {kind.__name__}")
     return value

@@ -75,7 +75,8 @@ def page_html(view: View) -> str:
     style = CSS + (here / "explore.css").read_text(encoding="utf-8")
     script = (here / "explore.js").read_text(encoding="utf-8")
     name = html.escape(str(view.facts["name"]))
-    described = json.dumps(header, ensure_ascii=False, allow_nan=False).replace("</", "<\\/")
+    # No "<" at all: "<!--" and "<script" change how the rest of a page is read, too.
+    described = json.dumps(header, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     return f"""<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
@@ -144,7 +145,8 @@ def _pressed(content: bytes) -> str:
 def _top(view: View) -> str:
     facts = view.facts
     said = [html.escape(sentence) for sentence in facts["said"]]
-    first = f"<h1 class={facts.get('tone', 'fine')!r}>{said[0]}</h1>" if said else ""
+    tone = html.escape(facts.get("tone", "fine"))
+    first = f'<h1 class="{tone}">{said[0]}</h1>' if said else ""
     rest = "".join(f"<p>{sentence}</p>" for sentence in said[1:])
     live = (
         '<p class="controls"><label><input type="checkbox" id="live" checked>'
@@ -241,7 +243,9 @@ def _change(view: View) -> str:
         return ""
     names = [p["axis"] for p in profiles]
     order = sorted(names, key=lambda name: name != "wall")
-    options = "".join(f'<option value="{n}">{html.escape(AXES.get(n, n))}</option>' for n in order)
+    options = "".join(
+        f'<option value="{html.escape(n)}">{html.escape(AXES.get(n, n))}</option>' for n in order
+    )
     return _section(
         "Before and after the diagnosis",
         "<p>How many standard deviations the counts lie above the simulation: as it was, and with what the "

@@ -22,7 +22,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from nlos_lit.capture.errors import UserError, suggest
+from nlos_lit.capture.errors import UserError, printable, suggest
 from nlos_lit.places import CONF
 from nlos_lit.runtime.command_line import as_typed, output_folder
 from nlos_lit.runtime.hooks import take_hooks
@@ -41,6 +41,11 @@ def look_over(command: str, arguments: list[str], about: str) -> None:
         about: first lines of ``--help``.
     """
     take_hooks()
+    for argument in arguments:
+        if not argument.isascii() and any("\ud800" <= c <= "\udfff" for c in argument):
+            told = printable(argument)
+            print(f"error: cannot use {told}: it is no text in UTF-8; rename the file", file=sys.stderr)
+            sys.exit(2)
     given = get_args_parser().parse_known_args(arguments)[0]
     if given.help:
         print(help_of(command, about))

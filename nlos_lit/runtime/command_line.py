@@ -29,6 +29,7 @@ REFUSED = MappingProxyType(
     {errno.ENOSPC: _FULL, errno.EDQUOT: _FULL, errno.EFBIG: _FULL}
     | {errno.EROFS: _CLOSED, errno.EACCES: _CLOSED, errno.EPERM: _CLOSED}
     | {errno.ENOTDIR: _NAMED, errno.EISDIR: _NAMED, errno.EEXIST: _NAMED, errno.ENAMETOOLONG: _NAMED}
+    | {errno.ELOOP: _NAMED}
 )
 
 

@@ -206,12 +206,24 @@ TRAINER: dict[str, Rule] = {
     "model_registry": optional(TEXT),
     "_target_": TEXT,
 }
+# What a run that goes on may do otherwise, where it is told to: it stays the same model of the same spots.
+CHANGEABLE = (
+    "batch_spots",
+    "objective.albedo_planes",
+    "objective.lambda_albedo",
+    "objective.lambda_sparsity",
+    "optimizer.clip",
+    "optimizer.rates.albedo",
+    "optimizer.rates.phasor",
+    "optimizer.rates.sensor",
+)
 TRAIN: dict[str, Rule] = {
     "folder": TEXT,
     "fit": word("volume", "surface"),
     "run": optional(FILE),
     "refine": FLAG,
     "effects": either(many(TEXT), TEXT),
+    "resume.change": many(word(*CHANGEABLE)),
     "ckpt_path": optional(either(word("last"), FILE)),
     "shard_field": FLAG,
     "batch_spots": whole(1, 10_000_000, "spots"),

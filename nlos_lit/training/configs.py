@@ -39,7 +39,7 @@ STARTS = ("ckpt_path", "run")  # what a run came from, which need not be there a
 # Of a run's config: what opening the run does not read, or what may be null as a whole.
 MADE = tuple(f"simulate.{name}" for name in ("mesh", "scan", "sensor"))
 MADE += tuple(f"source.{name}" for name in ("file", "origin", "url", "sha256"))
-UNREAD = (*STARTS, "folder", "trainer", "scene.simulate.", "scene.source.")
+UNREAD = (*STARTS, "resume.", "folder", "trainer", "scene.simulate.", "scene.source.")
 GIVEN = ("self", "logger", "callbacks")  # of the Trainer's arguments: groups of their own
 T = TypeVar("T")
 

@@ -41,6 +41,9 @@ LONGEST_NAME = 64  # characters of a capture's name
 RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 # Of a list of settings: neither an option of the command nor one of Hydra's own.
 SETTING = re.compile(r"(\+\+|\+|~)?(?!hydra\b)\w[\w./@-]*(=.*)?\Z", re.DOTALL)
+# Sections whose values may be places that are written to, and what names a place or may become one.
+WRITERS = ("trainer", "logger", "callbacks")
+PLACE = re.compile(r"[/\\~]|\.\.|\$\{")
 
 
 def register_names() -> None:
@@ -129,7 +132,8 @@ def resume_run(arguments: list[str]) -> None:
     Other arguments stand; one that is given replaces the run's own.
 
     Raises:
-        UserError: it is no run's folder, or its list is not one of settings alone.
+        UserError: it is no run's folder, its list is not one of settings alone, or one of them would write
+            elsewhere.
     """
     given = given_values(arguments)
     if "resume" not in given:
@@ -140,7 +144,15 @@ def resume_run(arguments: list[str]) -> None:
     now = [item for item in arguments[1:] if not item.startswith("resume=")]
     now += ["ckpt_path=last", f"hydra.run.dir='{folder}'"]
     replaced = {_key(item) for item in now}
-    arguments[1:] = [*(item for item in begun_with(folder) if _key(item) not in replaced), *now]
+    kept = [item for item in begun_with(folder) if _key(item) not in replaced]
+    for item in kept:
+        key, _, value = item.partition("=")
+        if re.split(r"[.@/]", key.lstrip("+"))[0] in WRITERS and PLACE.search(value):
+            raise UserError(
+                f"{folder / OVERRIDES} sets {item}, and a run that goes on may write into itself alone; if "
+                "it is yours and meant so, give that setting again on the command line"
+            )
+    arguments[1:] = [*kept, *now]
 
 
 def begun_from(folder: Path) -> Path | None:

@@ -14,6 +14,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.foreign import archived
 from nlos_lit.runtime.command_line import typed
+from nlos_lit.runtime.keys import CHANGEABLE
 
 # Settings that a checkpoint fits no other of, by what goes on from it; the capture is compared itself.
 START = ("seed", "heldout", "scene.volume")  # a surface, from the image of a finished run
@@ -21,6 +22,8 @@ IMAGE = (*START, "model", "ablation.optimise", "batch_spots", "objective", "opti
 SURFACE = (*IMAGE, "surfels", "effects")
 # Settings of a scene that make neither the capture nor its volume.
 BESIDE = ("scene.name", "scene.iterations", "scene.threshold", "scene.wavelength", "scene.falloff")
+PLAIN = str | int | float | None
+CHANGE = ("setting", "from", "to", "after")  # of an entry of what was changed
 TOLD = 4  # differences that a message names
 
 
@@ -32,22 +35,26 @@ def origin_of(settings: Mapping[str, Any], capture: Capture) -> dict[str, Any]:
         capture: as the scene's settings make it.
 
     Returns:
-        ``capture``, its hash, and ``settings``, by dotted name.
+        ``capture``, its hash, ``settings``, by dotted name, and ``changed``: nothing yet, see
+        :func:`changed_since`.
     """
     sections = {name.split(".")[0] for name in SURFACE} | {"scene"}
     shaping = {name: settings[name] for name in sections}
     if isinstance(shaping["effects"], str):
         shaping["effects"] = [shaping["effects"]]
-    return {"capture": capture.digest(), "settings": _flat(shaping)}
+    return {"capture": capture.digest(), "settings": flat(shaping), "changed": []}
 
 
-def check_origin(file: Path, origin: Mapping[str, Any], sections: Sequence[str]) -> None:
+def check_origin(
+    file: Path, origin: Mapping[str, Any], sections: Sequence[str], change: Sequence[str] = ()
+) -> None:
     """Refuse a checkpoint of another capture, or of other settings.
 
     Args:
         file: the checkpoint.
         origin: of the run that is to open it.
         sections: of the settings that must be the same: START, IMAGE or SURFACE.
+        change: settings among them, by name, that may differ.
 
     Raises:
         UserError: it is another's, with what differs, or no checkpoint of this project.
@@ -62,13 +69,43 @@ def check_origin(file: Path, origin: Mapping[str, Any], sections: Sequence[str])
         ]
         same_capture = kept["capture"] == origin["capture"]
     told = [name for name in differ if any(f"{name}.".startswith(f"{section}.") for section in sections)]
+    told = [name for name in told if name not in change]
     if not same_capture:  # the scene's settings may tell why
         told += [name for name in differ if name.startswith("scene.") and name not in told]
     words = [f"{name}={theirs.get(name)}, this command has {mine.get(name)}" for name in told[:TOLD]]
     if not same_capture:
         words.append("another capture than this command's")
     if words:
-        raise UserError(f"{file} was made with {'; '.join(words)}: give the same, or begin anew without it")
+        instead = "give the same, or begin anew without it"
+        if same_capture and sections == IMAGE and set(told) <= set(CHANGEABLE):
+            instead += f", or let it differ from here on: 'resume.change=[{','.join([*change, *told])}]'"
+        raise UserError(f"{file} was made with {'; '.join(words)}: {instead}")
+
+
+def changed_since(file: Path, origin: Mapping[str, Any], change: Sequence[str]) -> list[dict[str, Any]]:
+    """What a run has done otherwise since it was begun, so that its last settings do not stand for all of it.
+
+    Args:
+        file: the checkpoint that it goes on from.
+        origin: of the run, which :func:`check_origin` has compared.
+        change: settings that may differ.
+
+    Returns:
+        Earlier changes, then those of this command: ``setting``, its values ``from`` and ``to``, and
+        ``after``, the iterations that had been done.
+    """
+    state = read_checkpoint(file)
+    with sound(file):
+        kept, done = state["origin"], int(state["global_step"])
+        now = [
+            {"setting": name, "from": kept["settings"][name], "to": origin["settings"][name], "after": done}
+            for name in sorted(change)
+            if kept["settings"][name] != origin["settings"][name]
+        ]
+        before = [{key: entry[key] for key in CHANGE} for entry in kept.get("changed", ())]
+        if not all(isinstance(value, PLAIN) for entry in before for value in entry.values()):
+            raise TypeError("no settings")
+        return before + now
 
 
 @contextmanager
@@ -122,9 +159,17 @@ def finished_checkpoint(folder: Path) -> Path:
     return file
 
 
-def _flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
-    """Nested settings by dotted name."""
+def flat(values: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested settings by dotted name.
+
+    Args:
+        values: of a section.
+        above: its own name, with a dot behind.
+
+    Returns:
+        name → what is no section.
+    """
     found: dict[str, Any] = {}
     for name, value in values.items():
-        found |= _flat(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
+        found |= flat(value, f"{above}{name}.") if isinstance(value, Mapping) else {f"{above}{name}": value}
     return found

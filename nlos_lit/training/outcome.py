@@ -136,6 +136,7 @@ def write_results(
         },
         sparsity={"initial": first["sparsity"], "final": last["sparsity"]},
         iterations=len(history.seconds),
+        changed=run.origin["changed"],
         ablation=config["ablation"]["name"],
         optimised=module.optimised,
         estimated_memory_bytes=run.estimated_bytes,

@@ -33,6 +33,7 @@ from nlos_lit.training.folder import OVERRIDES, begun_from
 from nlos_lit.training.instantiate import builder
 from nlos_lit.training.origin import (
     IMAGE,
+    changed_since,
     check_origin,
     finished_checkpoint,
     origin_of,
@@ -97,6 +98,7 @@ def prepare_run(
     shards: int = 1,
     opens: Mapping[Path, Sequence[str]] = NO_CHECKPOINTS,
     raw: Capture | None = None,
+    change: Sequence[str] = (),
 ) -> Run:
     """Everything before the first iteration: capture, volume, memory, propagated phasor field, start values.
 
@@ -107,6 +109,7 @@ def prepare_run(
             the fit begins.
         opens: checkpoints that the run is to go on from → sections of settings that they must share.
         raw: the scene's file, where it has been read already.
+        change: settings that may differ from those of the checkpoints.
 
     Returns:
         The run, ready to fit.
@@ -120,7 +123,9 @@ def prepare_run(
     capture, truth = load_scene(scene, config["data_dir"], seed, config["force"], raw)
     origin = origin_of(config, capture)
     for file, sections in opens.items():
-        check_origin(file, origin, sections)
+        check_origin(file, origin, sections, change)
+        if sections == IMAGE:
+            origin["changed"] = changed_since(file, origin, change)
     effects = config["effects"]
     extension = Extension(build_effects([effects] if isinstance(effects, str) else effects, Scan.of(capture)))
     grid = volume_grid(capture, **scene["volume"])

@@ -169,6 +169,11 @@ class SelfCalibration(CaptureFit):
         """Of the groups that are optimised; Lightning calls it when the fit begins."""
         return self.make_optimizer(rated_groups(self.pipeline, self.rates, self.optimised))
 
+    def on_train_start(self) -> None:
+        """Take the rates of this run: an optimiser's state brings those of the checkpoint."""
+        for group in self.trainer.optimizers[0].param_groups:
+            group["lr"] = self.rates[group["name"]]
+
     def _freeze(self) -> None:
         """What is not optimised keeps its value."""
         self.groups = parameter_groups(self.pipeline)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import numpy as np
@@ -186,3 +187,14 @@ def test_weights_act_on_their_own_axis():
     )
     expected = np.array([50, 425])[:, None, None] + 25 + y[None, None]
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_volume_that_has_left_the_numbers_is_no_result(method):
+    capture = capture_of(WALL, WALL, [POINT], 128, 0.02)
+    counts = capture.counts.astype(np.float32)
+    counts[3, 60] = 3e38
+    broken = dataclasses.replace(capture, counts=counts, is_counts=False)
+    told = pytest.raises(CaptureError, match=r"has left the numbers \(NaN or infinite voxels\), which is no")
+    with told if method == "lct" else contextlib.suppress(CaptureError):
+        assert torch.isfinite(reconstruct(broken, GRID, method)).all()

@@ -96,3 +96,10 @@ def test_a_file_is_needed(tmp_path):
     with pytest.raises(UserError, match=r"no.mat does not exist; give a capture file"):
         look([str(tmp_path / "no.mat")])
     assert main(["--help"]) == 0
+
+
+def test_a_file_with_a_sign_of_assignment_in_its_name_is_a_file(confocal, tmp_path, capsys):
+    path = tmp_path / "a=b.hdf5"
+    path.symlink_to(confocal)
+    lines = told(path, tmp_path / "look", capsys)
+    assert commands(lines)[0][-2:] == ["scene=capture", f"scene.path='{path}'"]

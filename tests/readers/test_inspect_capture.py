@@ -13,6 +13,7 @@ import scipy.io
 from data_modules.examine import describe, examine
 from data_modules.readers import READERS, read_capture
 from nlos_lit.commands.inspect_capture import main as inspect_capture
+from nlos_lit.commands.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -123,6 +124,18 @@ def test_an_error_is_one_sentence_and_status_2(tmp_path):
     assert run.returncode == 2
     assert run.stdout == ""
     assert run.stderr == f"error: {tmp_path / 'nothing.mat'} does not exist; give a capture file\n"
+
+
+@pytest.mark.parametrize("name", ["é" * 124, "a\x1b[2Jb", "日本 'x\" $(b);<b>"])
+def test_any_name_that_a_file_can_have_is_taken(name, tmp_path, capsys):
+    capture = tmp_path / f"{name}.hdf5"
+    simulate([f"out={tmp_path}/a.hdf5", "nx=4", "ny=4", "n_bins=256", "bin_length=0.01"])
+    (tmp_path / "a.hdf5").rename(capture)
+    capsys.readouterr()
+    assert inspect_capture([str(capture), "--out", str(tmp_path)]) == 0
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out + said.err
+    assert [p.name for p in tmp_path.glob("*.png")] == [f"{name[:60]}_capture.png"]
 
 
 def test_the_help_names_every_format(capsys):

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +19,7 @@ from view_cases import irregular, view
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.commands import view as command
+from nlos_lit.io.files import whole_file
 from nlos_lit.io.views import FILE, LEVELS, read_view, write_view
 from nlos_lit.report.explore import LARGEST, page_html, wall_lattice, write_page
 
@@ -81,6 +85,85 @@ def test_what_is_said_is_escaped():
     assert "</script><b>" not in text
 
 
+EVIL = "<!--<script></script><b onload='x'>\" onload=\"x"
+
+
+def test_nothing_that_a_view_says_becomes_part_of_the_page():
+    facts = {
+        "name": EVIL,
+        "said": [EVIL, EVIL],
+        "tone": EVIL,
+        "next": {"text": EVIL, "command": EVIL},
+        "origin": {"command": EVIL, "capture": {EVIL: EVIL}, "provenance": {EVIL: [EVIL], "a": EVIL}},
+        "kept": {EVIL: EVIL},
+        "profiles": [{"axis": EVIL}],
+    }
+    kept = view(**facts)
+    kept = dataclasses.replace(kept, models={EVIL: kept.counts}, clouds={EVIL: kept.clouds["surfels"]})
+    text = page_html(kept)
+    own = text[: text.index('<script type="text/plain" id="data">')]
+    assert "<!--" not in own
+    assert "<b " not in own
+    assert own.count("<script") == own.count("</script>") == 1
+    assert not re.search(r"<[^>]*[\"']\s*onload=", own)
+    header = json.loads(own[own.index('id="header">') + 12 : own.index("</script>")])
+    assert header["facts"]["name"] == EVIL
+
+
+def test_the_command_opens_no_page_of_a_stranger(tmp_path):
+    write_view(tmp_path, view())
+    (tmp_path / "explore.html").write_text("<script>stranger</script>")
+    assert "stranger" not in command.page_of(tmp_path).read_text(encoding="utf-8")
+
+
+def test_an_effect_that_came_with_a_folder_is_not_run(tmp_path):
+    write_view(tmp_path / "diagnosis", view())
+    for name in ("effects/irf_tail.py", "effects/__init__.py", "numpy.py"):
+        file = tmp_path / "diagnosis" / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "view.py"), str(tmp_path), "--no-open"],
+        cwd=tmp_path / "diagnosis", env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "facts",
+    [{"status": "x"}, {"said": [3]}, {"said": None}, {"profiles": [4]}, {"tone": 3}, {"at": "\ud800"}],
+)
+def test_the_command_says_in_a_sentence_that_a_view_holds_something_else(tmp_path, facts):
+    write_view(tmp_path, view(**facts))
+    with pytest.raises(UserError, match=r"view\.npz is damaged"):
+        command.page_of(tmp_path)
+
+
+@pytest.mark.parametrize("status", ["running", "finished"])
+def test_a_folder_that_nothing_may_be_written_to_is_shown_from_elsewhere(tmp_path, monkeypatch, status):
+    write_view(tmp_path, view(status=status))
+    before = sorted(tmp_path.iterdir())
+
+    def refuses(path, *_, **__):
+        if Path(path).is_relative_to(tmp_path):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return opened(path, *_, **__)
+
+    opened = os.open
+    monkeypatch.setattr(os, "open", refuses)
+    monkeypatch.setattr(
+        "nlos_lit.report.explore.whole_file",
+        lambda file: refuses(file) if tmp_path in file.parents else whole_file(file),
+    )
+    page = command.page_of(tmp_path)
+    assert not page.is_relative_to(tmp_path)
+    assert "<main>" in page.read_text(encoding="utf-8")
+    assert sorted(tmp_path.iterdir()) == before
+    shutil.rmtree(page.parent)
+
+
 def test_a_page_that_is_too_large_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("nlos_lit.report.explore.LARGEST", 10_000)
     with pytest.raises(ValueError, match="at most 10000"):
@@ -131,7 +214,8 @@ def test_the_command_prefers_the_diagnosis_and_says_what_is_no_run(tmp_path, cap
     write_view(tmp_path, view())
     write_view(tmp_path / "diagnosis", dataclasses.replace(view(), models={}))
     assert command.page_of(tmp_path) == tmp_path / "diagnosis" / "explore.html"
-    assert command.main([str(tmp_path / "nowhere"), "--no-open"]) == 2
+    with pytest.raises(SystemExit):
+        command.main([str(tmp_path / "nowhere"), "--no-open"])
     assert "it is no run's folder" in capsys.readouterr().err
 
 

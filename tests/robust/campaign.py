@@ -18,6 +18,7 @@ ROWS = ROOT / "docs" / "robustness_rows.jsonl"
 PAGE = ROOT / "docs" / "robustness.md"
 BEGIN, END = "<!-- rows: made by tests/robust/campaign.py -->", "<!-- end of rows -->"
 SHOWN = 2  # failures of a row
+SAME = ("mistakes", "nonsense")  # parts that try the same each time; in the others chance has a part
 FORMATS = ("ytal", "lct", "fk", "phasor_field", "zaragoza", "chen", "tsai_ahn", "cid")
 PARTS = (
     ["mistakes.py"],
@@ -39,7 +40,7 @@ def tables(rows: list[dict[str, Any]]) -> str:
     """Markdown of all parts: how many were tried, refused, accepted, failed."""
     told = []
     for part, title in TITLES.items():
-        made = [row for row in rows if row["part"] == part]
+        made = counted([row for row in rows if row["part"] == part])
         if not made:
             continue
         of_part = [
@@ -57,6 +58,25 @@ def tables(rows: list[dict[str, Any]]) -> str:
         where = sorted({f"`{row['command']}` at {row['commit']}" for row in made})
         told += ["", "Made by:", "", *(f"- {one}" for one in where), ""]
     return "\n".join(told).rstrip()
+
+
+def counted(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Rows without those that a newer one repeats; what failed in these is kept by the newer one.
+
+    Args:
+        rows: of one part, in the order in which they were made.
+
+    Returns:
+        All of them where chance has a part; else the newest of each name.
+    """
+    if not rows or rows[0]["part"] not in SAME:
+        return rows
+    newest: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        before = newest.get(_name(row), {"failures": []})
+        earlier = [f"at {before['commit']}: {failure}" for failure in before["failures"]]
+        newest[_name(row)] = row | {"failures": [*earlier, *row["failures"]]}
+    return list(newest.values())
 
 
 def summed(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -45,6 +45,19 @@ def test_runs_of_one_command_are_one_line():
     assert "`x.py` at b" in told
 
 
+def test_what_is_tried_again_alike_counts_once_and_keeps_what_failed():
+    row = {"part": "mistakes", "kind": "train", "tried": 10, "refused": 9, "failures": ["a=b: a traceback"]}
+    newer = row | {"tried": 12, "refused": 12, "failures": []}
+    both = [made | {"commit": c, "command": "x.py"} for c, made in (("a", row), ("b", newer))]
+    told = campaign.tables(both)
+    assert "| train | 12 | 12 | 0 | 0 | 0 |" in told
+    assert "- train: `at a: a=b: a traceback`" in told
+    assert "`x.py` at b" in told
+    assert "`x.py` at a" not in told
+    drawn = [made | {"part": "disks"} for made in both]
+    assert "| train | 22 | 21 | 0 | 0 | 1 |" in campaign.tables(drawn)
+
+
 def test_every_part_names_a_script():
     for script, *_ in campaign.PARTS:
         assert (campaign.HERE / script).is_file()

@@ -17,12 +17,13 @@ import torch
 from conftest import ROOT
 
 from nlos_lit.capture.errors import UserError
+from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.io.files import whole_file
 from nlos_lit.io.tensors import write_tensors
 from nlos_lit.runtime.command_line import sentence_errors
 from nlos_lit.runtime.memory import check_disk
 from nlos_lit.training.callbacks import WholeCheckpoints
-from nlos_lit.training.configs import compose
+from nlos_lit.training.configs import compose, register_settings
 from nlos_lit.training.folder import take_given_folder
 from nlos_lit.training.instantiate import builder
 
@@ -91,6 +92,23 @@ def test_what_the_disk_refuses_is_one_sentence_with_the_file(tmp_path, capsys, c
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: {tmp_path}/volume.h5: {os.strerror(code)}; ")
+
+
+@pytest.mark.parametrize("where", ["hydra.core.utils._save_config", "logging.FileHandler._open"])
+def test_a_disk_that_is_full_when_hydra_writes_is_one_sentence(tmp_path, monkeypatch, capsys, where):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(where, full)
+    monkeypatch.setattr("sys.argv", ["reconstruct.py"])
+    with pytest.raises(SystemExit) as end:
+        compose_and_run(
+            "reconstruct", lambda _: register_settings(), print, [f"hydra.run.dir={tmp_path}/run"]
+        )
+    assert end.value.code == 2
+    assert capsys.readouterr().err.splitlines() == [
+        "error: a result: No space left on device; make room, or write elsewhere"
+    ]
 
 
 def test_other_errors_of_the_system_keep_their_traceback():

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import struct
 import threading
 import zipfile
@@ -11,6 +12,7 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+from conftest import ROOT
 from omegaconf import OmegaConf
 
 from data_modules.readers import detect_format, mat5, read_capture
@@ -286,3 +288,21 @@ def test_ground_truth_is_read_as_carefully_as_a_capture(tmp_path):
     (tmp_path / "truth.h5").write_bytes(half)
     with pytest.raises(UserError, match="damaged or truncated"):
         load_truth(tmp_path / "truth.h5")
+
+
+def test_no_code_is_loaded_by_a_name_or_a_file_but_our_own():
+    loads = re.compile(
+        r"\bexec\(|(?<![.\w])eval\(|import_module|spec_from_file|runpy|pickle\.load|unsafe_load"
+    )
+    found = {
+        str(file.relative_to(ROOT))
+        for package in ("nlos_lit", "data_modules")
+        for file in (ROOT / package).rglob("*.py")
+        if loads.search(file.read_text(encoding="utf-8"))
+    }
+    # Modules of this package, by names that stand in its own lists.
+    assert found == {
+        "nlos_lit/effects/registry.py",
+        "nlos_lit/commands/nlos.py",
+        "nlos_lit/paper/workspace.py",
+    }

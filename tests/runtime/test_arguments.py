@@ -20,7 +20,7 @@ from data_modules.simulate.plan import KINDS
 from nlos_lit.baselines import METHODS
 from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime import arguments, keys
-from nlos_lit.runtime.arguments import begun, check_assignments, check_overrides
+from nlos_lit.runtime.arguments import begun, check_assignments, check_overrides, look_over
 from nlos_lit.runtime.keys import KEYS
 from nlos_lit.runtime.schema import Rule
 from nlos_lit.training.configs import compose
@@ -290,6 +290,16 @@ def test_help_says_what_a_command_takes(command, told):
     done = run(f"{command}.py", "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert told in done.stdout
+
+
+def test_a_name_that_is_no_text_is_one_sentence(capsys):
+    with pytest.raises(SystemExit) as end:
+        look_over("train", ["scene=capture", "scene.path=a\udcff\x1b[2J.mat"], "")
+    assert end.value.code == 2
+    said = capsys.readouterr().err
+    assert (
+        said == "error: cannot use scene.path=a\\udcff\\x1b[2J.mat: it is no text in UTF-8; rename the file\n"
+    )
 
 
 def test_a_missing_path_is_said_before_the_libraries_are_loaded(tmp_path):

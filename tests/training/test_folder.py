@@ -83,6 +83,24 @@ def test_a_foreign_folder_sets_settings_and_nothing_else(tmp_path, begun_with):
         resume_run(["train.py", f"resume={tmp_path}"])
 
 
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "callbacks.checkpoint.dirpath=/elsewhere", "callbacks.checkpoint.dirpath=../..",
+        "+logger.other={_target_: lightning.pytorch.loggers.CSVLogger, save_dir: ~}",
+        "+logger.other.save_dir='${oc.env:HOME}'", "trainer.default_root_dir=a/b", "++logger@x.save_dir=/x",
+    ],
+)  # fmt: skip
+def test_a_foreign_folder_names_no_other_place_to_write_to(tmp_path, setting):
+    (tmp_path / OVERRIDES).write_text(json.dumps(["trainer.max_steps=3", "~callbacks.figures", setting]))
+    with pytest.raises(UserError, match=r"may write into itself alone; .* again on the command line"):
+        resume_run(["train.py", f"resume={tmp_path}"])
+    if "other=" not in setting:
+        arguments = ["train.py", f"resume={tmp_path}", setting]
+        resume_run(arguments)
+        assert arguments.count(setting) == 1
+
+
 def test_only_a_run_can_be_resumed(tmp_path):
     with pytest.raises(
         UserError, match=r"is not the folder of a run that has begun: overrides\.json is missing"

@@ -15,9 +15,11 @@ from nlos_lit.commands.train import fit_or_leave, make_trainer
 from nlos_lit.runtime.command_line import quiet_libraries
 from nlos_lit.training.configs import compose
 from nlos_lit.training.origin import (
+    CHANGE,
     IMAGE,
     START,
     SURFACE,
+    changed_since,
     check_origin,
     finished_checkpoint,
     origin_of,
@@ -119,6 +121,7 @@ def test_every_setting_is_compared_or_makes_no_other_fit(case):
         "threads",
         "memory_budget",
         "force",
+        "resume",
     }
     shown = {"shard_field", "export", "trainer", "callbacks", "logger", "experiment", "profile"}
     compared = {name.split(".")[0] for name in SURFACE} | {"scene"}
@@ -152,6 +155,45 @@ def test_going_on_from_a_finished_run_is_unfinished_until_its_end(case):
     score = next(callback for callback in case.trainer.callbacks if hasattr(callback, "on_fit_end"))
     score.on_train_start(case.trainer, module)
     assert set(module.scores) == {"initial"}
+
+
+@pytest.mark.filterwarnings("ignore:The dirpath has changed")
+def test_a_change_that_is_named_is_made_and_kept(case, tmp_path):
+    new = ["optimizer.rates.albedo=0.01", "batch_spots=4", "scene.iterations=4", f"folder={tmp_path}"]
+    config, change = case.changed(*new), ["batch_spots", "optimizer.rates.albedo"]
+    sentence = r"or let it differ from here on: 'resume.change=\[batch_spots,optimizer.rates.albedo\]"
+    with pytest.raises(UserError, match=sentence):
+        check_origin(case.last, case.origin(*new), IMAGE)
+    with pytest.raises(UserError, match=r"seed=0, this command has 1: give the same, or .* without it$"):
+        check_origin(case.last, case.origin(*new, "seed=1"), IMAGE, change)
+    again = prepare_run(config, opens={case.last: IMAGE}, change=change)
+    quiet_libraries()
+    trainer = make_trainer(config)
+    fit_or_leave(trainer, again.module, again, case.last)
+    rates = {group["name"]: group["lr"] for group in trainer.optimizers[0].param_groups}
+    assert rates == {"phasor": 0.05, "sensor": 0.1, "albedo": 0.01}
+    made = [
+        {"setting": "batch_spots", "from": 8, "to": 4, "after": 2},
+        {"setting": "optimizer.rates.albedo", "from": 0.3, "to": 0.01, "after": 2},
+    ]
+    last = tmp_path / "checkpoints" / "last.ckpt"
+    assert again.origin["changed"] == read_checkpoint(last)["origin"]["changed"] == made
+    check_origin(last, case.origin(*new), IMAGE)  # from here on as any run
+    assert changed_since(last, case.origin(*new), change) == made
+    back = [*made, {"setting": "batch_spots", "from": 4, "to": 8, "after": 4}]
+    assert changed_since(last, case.origin(*new, "batch_spots=8"), change) == back
+
+
+def test_of_an_earlier_version_or_a_stranger_nothing_else_is_taken_for_a_change(case, tmp_path):
+    state, file = read_checkpoint(case.last), tmp_path / "last.ckpt"
+    del state["origin"]["changed"]
+    torch.save(state, file)
+    assert changed_since(file, case.origin(), []) == []
+    for strange in (3, [3], [{"setting": "seed"}], [dict.fromkeys(CHANGE, torch.zeros(2))]):
+        state["origin"]["changed"] = strange
+        torch.save(state, file)
+        with pytest.raises(UserError, match="is damaged, or no checkpoint"):
+            changed_since(file, case.origin(), [])
 
 
 def test_what_is_no_checkpoint_of_ours_is_one_sentence(tmp_path):

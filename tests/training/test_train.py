@@ -320,6 +320,8 @@ def test_every_profile_has_finite_losses_and_gradients(profile):
 
 BAD = {
     "scene=bike": "needs bike/meas_10min.mat",
+    "scene=su +scene.simulate.scan.nx=8": "scene.simulate lacks mesh and sensor: leave it out",
+    "scene=su scene.simulate.scan.nx=8": "the config cannot be put together: Could not override",
     "scene=capture": "scene.path=FILE",
     "scene=capture scene.path=/nowhere/x.mat": "must be a file or folder that is there",
     "scene.gate=[200,200]": "scene.gate must be",
