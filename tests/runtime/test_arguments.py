@@ -22,6 +22,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime import arguments, keys
 from nlos_lit.runtime.arguments import begun, check_assignments, check_overrides
 from nlos_lit.runtime.keys import KEYS
+from nlos_lit.runtime.meanings import meanings
 from nlos_lit.runtime.schema import Rule
 from nlos_lit.training.configs import compose
 
@@ -280,9 +281,10 @@ def run(*words: str) -> subprocess.CompletedProcess:
             "train",
             "scene.threshold: a number above 0 to below 1  # intensity below which there is no surface",
         ),
-        ("diagnose", "criticism.level: a number above 0 to below 1"),
+        ("diagnose", "criticism.processes: a whole number from 1 to 1024  # that work on them; rebuilds"),
+        ("reconstruct", "method.options.snr: a number above 0 to 1e+12  # power of the signal over"),
         ("reconstruct", "  method       bp, dlct, fbp, fk, lct, rsd"),
-        ("simulate", "  nx: a whole number from 1 to 10000"),
+        ("simulate", "  nx: a whole number from 1 to 10000  # grid points along x and y"),
         ("results", "size=full|reduced"),
     ],
 )
@@ -290,6 +292,21 @@ def test_help_says_what_a_command_takes(command, told):
     done = run(f"{command}.py", "--help")
     assert (done.returncode, done.stderr) == (0, "")
     assert told in done.stdout
+
+
+@pytest.mark.parametrize("command", KEYS)
+def test_help_says_what_settings_mean(command):
+    """All but those of Lightning's Trainer, which are explained there, and names that say it."""
+    told = meanings(command)
+    plain = {"ablation.name", "method.name", "scene.source", "optimizer.method"}
+    silent = [
+        key
+        for key in KEYS[command]
+        if not (key in told or key.rpartition(".")[0] in told or key in plain)
+        and not key.startswith(("trainer.", "ablation.optimise."))
+    ]
+    assert silent == []
+    assert [text for text in told.values() if ":class:" in text or "``" in text or "\n" in text] == []
 
 
 def test_a_missing_path_is_said_before_the_libraries_are_loaded(tmp_path):
