@@ -195,7 +195,7 @@ def _instead(key: str, known: Iterable[str]) -> str:
     start = f"{section}." if section else ""
     beside = dict.fromkeys(other[len(start) :].split(".")[0] for other in known if other.startswith(start))
     if section and beside:
-        return suggest(name, beside)
+        return suggest(name, beside, above=start)
     return suggest(
         key, dict.fromkeys([*known, *beside]), dict.fromkeys(other.split(".")[0] for other in known)
     )

@@ -168,8 +168,12 @@ def words_as_settings(command: str, arguments: list[str]) -> list[str]:
         path = first[0]
         if not os.path.exists(path):
             raise UserError(f"{path} does not exist; give a capture file, or settings KEY=VALUE: --help")
-        is_run = command == "diagnose" and os.path.exists(os.path.join(path, "config.yaml"))
-        first = [f"run={quoted(path)}"] if is_run else ["scene=capture", f"scene.path={quoted(path)}"]
+        is_run = os.path.exists(os.path.join(path, "config.yaml"))
+        if command == "diagnose" and is_run:
+            first = [f"run={quoted(path)}"]
+        else:
+            _refuse_folder(command, path, is_run)
+            first = ["scene=capture", f"scene.path={quoted(path)}"]
     if command != "diagnose":
         return first + rest
     found, words = [], iter(first + rest)
@@ -182,6 +186,17 @@ def words_as_settings(command: str, arguments: list[str]) -> list[str]:
             word = f"split_with={quoted(file)}"
         found.append(word)
     return found
+
+
+def _refuse_folder(command: str, path: str, is_run: bool) -> None:
+    """Refuse a folder in which no reader would look for a capture."""
+    if not os.path.isdir(path) or any(name.endswith(".mat") for name in os.listdir(path)):
+        return
+    if command == "train" and is_run:
+        instead = f"to go on with that run say resume={path}"
+    else:
+        instead = "give a capture file" + (", or a finished run's folder" if command == "diagnose" else "")
+    raise UserError(f"{path} is a folder without a capture (no .mat file is in it); {instead}")
 
 
 def settings_as_words(command: str, settings: list[str]) -> list[str]:

@@ -53,6 +53,15 @@ def test_a_file_is_taken_as_it_is(tmp_path):
     assert words_as_settings("simulate", ["mine.mat"]) == ["mine.mat"]
     with pytest.raises(UserError, match=r"nowhere.mat does not exist; give a capture file, or settings"):
         words_as_settings("train", ["nowhere.mat"])
+    held = tmp_path / "holds no capture"
+    held.mkdir()
+    for command, folder, instead in (
+        ("train", held, "give a capture file$"),
+        ("diagnose", held, "give a capture file, or a finished run's folder$"),
+        ("train", run, f"to go on with that run say resume={run}$"),
+    ):
+        with pytest.raises(UserError, match=f"is a folder without a capture .*; {instead}"):
+            words_as_settings(command, [str(folder)])
     with pytest.raises(UserError, match="--split-with needs a capture file behind it"):
         words_as_settings("diagnose", [str(run), "--split-with"])
 
