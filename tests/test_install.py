@@ -46,10 +46,14 @@ def source(folder: Path, names: Iterable[str] = SOURCE) -> Path:
     return folder
 
 
+def outside() -> dict[str, str]:
+    """The environment without what would put the checkout in front of an installation."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     """What Python prints, outside the checkout, with an installation in front of all other packages."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    env = kept if path is None else {**kept, "PYTHONPATH": str(path)}
+    env = outside() if path is None else {**outside(), "PYTHONPATH": str(path)}
     done = subprocess.run(
         [sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, check=False
     )
@@ -165,6 +169,6 @@ def test_a_fresh_environment_takes_wheel_and_source(dist, tmp_path):
         if again:
             subprocess.run(again, check=True)
         for words in (["--version"], simulate, ["look", "mine.hdf5"]):
-            subprocess.run([place / "nlos", *words], cwd=tmp_path, check=True)
+            subprocess.run([place / "nlos", *words], cwd=tmp_path, env=outside(), check=True)
         assert (tmp_path / "outputs" / "mine" / "look" / "look.png").exists()
         shutil.rmtree(tmp_path / "outputs")
