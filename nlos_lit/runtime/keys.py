@@ -244,7 +244,7 @@ METHOD: dict[str, Rule] = {
 }
 SIMULATE: dict[str, Rule] = {
     "scene": word(*MESHES, "mesh", "two_albedo"),
-    "bodies": optional(many(SETTINGS)),
+    "bodies": optional(either(many(SETTINGS), SETTINGS)),
     "random": optional(whole(0)),
     "mesh": optional(FILE),
     "out": optional(TEXT),
