@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
+PREDICTED = 0.25  # of what select spots leave unexplained without a term: who explains that much is believed
 WARM = 120  # batches, and as many again at falling rate
 
 
@@ -141,11 +142,6 @@ class Turn:
     confirmed: Confirmed | None = None
     accepted: bool = False
     refused: dict[str, Confirmed] = field(default_factory=dict)
-
-
-Told = Callable[
-    [SurfelFit, SurfelFit, list[Turn]], None
-]  # fine fit without effects, present one, turns so far
 
 
 @dataclass
@@ -335,7 +331,7 @@ class Loop:
         jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
         jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
         trials = weighed(self._trials(jobs), self.block)
-        return self._chosen(replace(turn, trials=trials), trials)
+        return self.among(replace(turn, trials=trials), trials)
 
     def next_best(self, turn: Turn) -> Turn | None:
         """The turn with what is chosen in place of a term of which a fine scene left too little.
@@ -357,13 +353,22 @@ class Loop:
         if len(left) == 1:
             return None
         bare = replace(turn, best=None, group={}, confirmed=None)
-        other = self._chosen(bare, weighed(left, self.block))
+        other = self.among(bare, weighed(left, self.block))
         if other.best is None:
             return None
         self.steps.plan(screen=1, fit=2)
         return replace(other, refused=refused)
 
-    def _chosen(self, turn: Turn, trials: list[Trial]) -> Turn:
+    def among(self, turn: Turn, trials: list[Trial]) -> Turn:
+        """The turn with what is chosen among some of its trials.
+
+        Args:
+            turn: without a best term.
+            trials: with weights, the largest gain first; that with none is one of them.
+
+        Returns:
+            the turn; its ``best`` is None where nothing is chosen.
+        """
         best = chosen(trials, self.settings)
         if best is None:
             return turn
@@ -380,11 +385,14 @@ class Loop:
             its own evidence and what it needs, nats.
         """
         assert turn.best is not None
+        tried = "" if turn.confirmed is None else "_again"
+        return self._own(turn, fine, f"turn{self.number}_own_{turn.best.name}{tried}")
+
+    def _own(self, turn: Turn, fine: SurfelFit, kept: str) -> tuple[float, float]:
+        assert turn.best is not None
         s, name = self.settings, turn.best.name
         own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
-        tried = "" if turn.confirmed is None else "_again"
-        text, kept = f"asking for {name} again", f"turn{self.number}_own_{name}{tried}"
-        nats, lit = self.steps("screen", text, kept, own)
+        nats, lit = self.steps("screen", f"asking for {name} again", kept, own)
         misfit = self._misfit(fine, self.split.fit, self.split.select)
         return nats, needed(turn.candidates, s, misfit, lit)
 
@@ -405,6 +413,32 @@ class Loop:
         found = Confirmed(*own, compare(before, after, self.block), weight)
         yes = found.evidence > found.needed and weight > 1 - self.settings.open_share
         return replace(turn, confirmed=found, accepted=yes)
+
+    def held(self, turns: list[Turn], scene: SurfelFit) -> list[Turn]:
+        """Is each of several terms asked for beside all others?
+
+        By its own evidence, or by the share that it explains of what the select spots leave unexplained
+        without it; and they must be predicted better with it.
+
+        Args:
+            turns: with a best term each.
+            scene: with all of them.
+
+        Returns:
+            the turns, accepted or not.
+        """
+        select, names = self.split.select, [turn.best.name for turn in turns if turn.best is not None]
+        kept = f"company{self.number}_{'_'.join(names)}"
+        whole, *fewer = self.absences(scene, names, kept)
+        value, found = log_likelihood(whole, select), []
+        for turn, name, fit in zip(turns, names, fewer, strict=True):
+            evidence, least = self._own(turn, scene, f"{kept}_own_{name}")
+            before = log_likelihood(fit, select)
+            gain, weight = compare(before, value, self.block), weights([before, value], self.block)[1]
+            explained = gain.nats > PREDICTED * misfit_of(fit, select, len(select))
+            yes = (evidence > least or explained) and weight > 1 - self.settings.open_share
+            found.append(replace(turn, confirmed=Confirmed(evidence, least, gain, weight), accepted=yes))
+        return found
 
     def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:
         """Is the turn's best term still asked for beside a fine scene, in one of two ways?
@@ -550,12 +584,24 @@ class Loop:
         names = [e.name for e in fit.extension.effects]
         if not names:
             return {}
-        jobs = [("going on with all", "all", partial(self._warm, fit, []))]
-        jobs += [(f"going on without {n}", f"all_but_{n}", partial(self.without, fit, n)) for n in names]
-        self.steps.plan(fit=len(jobs))
-        fits = self.steps.several("fit", jobs, self.settings.processes)
-        whole, *fewer = [log_likelihood(f, self.split.select) for f in fits]
+        whole, *fewer = [log_likelihood(f, self.split.select) for f in self.absences(fit, names, "all")]
         return {n: compare(v, whole, self.block) for n, v in zip(names, fewer, strict=True)}
+
+    def absences(self, fit: SurfelFit, names: list[str], kept: str) -> list[SurfelFit]:
+        """The same scene gone on with all terms, and without each of some.
+
+        Args:
+            fit: with the terms.
+            names: of those that are left out, one at a time.
+            kept: name of the steps.
+
+        Returns:
+            one more than names.
+        """
+        jobs = [("going on with all", kept, partial(self._warm, fit, []))]
+        jobs += [(f"going on without {n}", f"{kept}_but_{n}", partial(self.without, fit, n)) for n in names]
+        self.steps.plan(fit=len(jobs))
+        return self.steps.several("fit", jobs, self.settings.processes)
 
 
 def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
@@ -576,6 +622,11 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
 def is_law(candidate: Candidate | None) -> bool:
     """A term that is an effect, and not one with a number for each spot."""
     return candidate is not None and candidate.name not in FREE_NAMES and not candidate.effect.per_spot
+
+
+def per_spot(turn: Turn) -> bool:
+    """The turn's best term has a number for each spot."""
+    return turn.best is not None and turn.best.candidate is not None and turn.best.candidate.effect.per_spot
 
 
 def leaders(candidates: list[Candidate], number: int) -> list[Candidate]:
@@ -644,51 +695,3 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) 
     shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
     left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
     return {name: weight / sum(left.values()) for name, weight in left.items()}
-
-
-def criticise(
-    base: SurfelFit,
-    rebuild: Rebuild,
-    grow: Grow,
-    split: Split,
-    scan: Scan,
-    s: CriticismSettings,
-    seed: int,
-    steps: Steps | None = None,
-    told: Told = lambda base, present, turns: None,
-) -> Findings:
-    """Find out, one after the other, what the capture asks for.
-
-    Args:
-        base: fitted to ``split.fit`` without effects, coarse.
-        rebuild, grow: see :class:`Loop`.
-        split: of the spots.
-        scan: of the capture.
-        s: settings.
-        seed: of everything random.
-        steps: says and keeps what is done.
-        told: called before the first turn and after each, see :data:`Told`.
-
-    Returns:
-        base, turns and final fit.
-    """
-    loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
-    first = fine = loop.fine(base, "without_effects")
-    coarse = base
-    turns: list[Turn] = []
-    told(first, fine, turns)
-    while len(coarse.extension.effects) < s.most:
-        turn = loop.turn(coarse, fine)
-        while turn.best is not None:
-            turn, again, refined = loop.asked_again(turn, fine)
-            other = None if turn.accepted else loop.next_best(turn)
-            if other is None:
-                break
-            turn = other
-        turns.append(turn)
-        if turn.accepted:
-            coarse, fine = again, refined
-        told(first, fine, turns)
-        if not turn.accepted:
-            break
-    return Findings(first, fine, turns, loop.losses(fine), coarse if fine is not first else None)

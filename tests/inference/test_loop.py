@@ -15,6 +15,7 @@ from torch import Tensor
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference import company, turns
 from nlos_lit.inference import criticise as loop
 from nlos_lit.inference.criticise import (
     CriticismSettings,
@@ -25,7 +26,6 @@ from nlos_lit.inference.criticise import (
     begun_with,
     chosen,
     copy_effects,
-    criticise,
     group_of,
     leaders,
     misfit_of,
@@ -90,6 +90,7 @@ class World:
         own: evidence of terms beside a fine scene; that of the pool where nothing is said.
         impossible: effects with which no surfel survives a rebuild.
         misfit: nats that every fine scene leaves of select spots. taken_up: of the fitted spots, fewer.
+        together: what is refused is asked for in company.
     """
 
     def __init__(
@@ -101,16 +102,21 @@ class World:
         impossible: tuple[str, ...] = (),
         misfit: float = 0.0,
         taken_up: float = 0.0,
+        together: bool = False,
     ) -> None:
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
+        self.together = together
         self.rebuilt: list[tuple[frozenset[str], int]] = []
         self.grown: list[frozenset[str]] = []
         self.asked: list[bool] = []
-        monkeypatch.setattr(loop, "log_likelihood", self.likelihood)
+        for module in (loop, company):
+            monkeypatch.setattr(module, "log_likelihood", self.likelihood)
         monkeypatch.setattr(loop, "ask", self.ask)
         monkeypatch.setattr(loop, "own_evidence", self.own_evidence)
         by = {len(SPLIT.select): misfit, len(SPLIT.fit): misfit - taken_up}
-        monkeypatch.setattr(loop, "misfit_of", lambda fit, spots, number: by[len(spots)] * (number == 300))
+        monkeypatch.setattr(loop, "misfit_of", lambda fit, spots, number: by[len(spots)] * number / 300)
+        if not together:
+            monkeypatch.setattr(turns, "in_company", lambda *_: None)
 
     def likelihood(self, fit: FakeFit, spots: np.ndarray) -> Tensor:
         assert np.array_equal(spots, SPLIT.select)
@@ -127,7 +133,7 @@ class World:
         self, fit: FakeFit, split: object, most: int, seed: int, name: str
     ) -> tuple[float, float]:
         assert name in fit.names
-        assert fit.fine
+        assert fit.fine or self.together
         found = next(c for c in self.pool if c.name == name)
         return self.own.get(name, found.evidence), found.lit
 
@@ -156,7 +162,7 @@ class World:
         return loop.confirm(turn, loop.own(turn, fine), fine, fitted(fine=True))
 
     def criticise(self, s: CriticismSettings = SETTINGS) -> Findings:
-        return criticise(fitted(), self.rebuild, self.grow, SPLIT, SCAN, s, 4)
+        return turns.criticise(fitted(), self.rebuild, self.grow, SPLIT, SCAN, s, 4)
 
 
 def trial(name: str, likelihood: Tensor) -> Trial:
@@ -469,3 +475,77 @@ def test_a_loop_that_finds_nothing(monkeypatch):
     assert isinstance(found, Findings)
     assert (found.accepted, found.again, len(found.turns), found.losses) == ([], None, 1, {})
     assert found.base is found.final
+
+
+def nats(value: float) -> Tensor:
+    """``[120]`` of which every spot has the same share."""
+    return NOTHING + value / 120
+
+
+def hidden(monkeypatch, gains: dict[str, float], misfit: float = 100.0, **own: float) -> World:
+    """A world whose terms have next to no evidence of their own beside any scene, but for those named."""
+    pool = [candidate(name, 1e6) for name in gains]
+    table = {name: nats(value) for name, value in gains.items()}
+    return World(monkeypatch, table, pool, dict.fromkeys(gains, 1.0) | own, misfit=misfit, together=True)
+
+
+@pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
+def test_terms_that_are_refused_alone_are_asked_for_in_company(monkeypatch, gain, accepted):
+    """Each explains a quarter of what 120 spots leave unexplained without it: 40 nats. One alone is none."""
+    world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": gain})
+    found = world.criticise()
+    names = {"irf_tail", "vignetting"} if accepted else set()
+    assert {t.best.name for t in found.accepted} == found.final.names == names
+    assert found.losses.keys() == names
+    assert found.turns[-1].best is None if accepted else not found.turns[-1].accepted
+    if accepted:
+        assert [(t.confirmed.evidence, t.confirmed.gain.nats) for t in found.accepted] == [
+            (1.0, pytest.approx(40.0)),
+            (1.0, pytest.approx(gain)),
+        ]
+        assert [t.refused for t in found.accepted] == [{}, {}]
+
+
+def test_who_does_not_hold_leaves_the_company(monkeypatch):
+    world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0, "pile_up": 5.0})
+    found = world.criticise()
+    assert found.final.names == found.again.names == {"irf_tail", "vignetting"}
+    assert {"irf_tail", "vignetting", "pile_up"} in world.grown
+
+
+@pytest.mark.parametrize(("evidence", "held"), [(14.8, True), (14.6, False)])
+def test_evidence_holds_in_company_too(monkeypatch, evidence, held):
+    """ln(1/level) = 4.6 and a tenth of 100; what is gained is less than a quarter of the misfit."""
+    world = hidden(monkeypatch, {"irf_tail": 5.0}, irf_tail=evidence)
+    turn = world.turn()
+    assert [t.accepted for t in world.loop().held([turn], fitted("irf_tail", fine=True))] == [held]
+
+
+def test_a_company_must_predict_better_than_a_finer_scene(monkeypatch):
+    for finer, names in ((60.0, {"irf_tail", "vignetting"}), (80.0, set())):
+        world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0})
+        world.table |= {"fine": nats(finer), "fine+irf_tail+vignetting": nats(70.0)}
+        world.table |= {"fine+irf_tail": nats(40.0), "fine+vignetting": nats(30.0)}
+        assert world.criticise().final.names == names
+
+
+def test_the_company_keeps_the_scene_that_predicts_best(monkeypatch):
+    """A scene that was refined may have taken up noise."""
+    for finer, fine in ((1.0, True), (-1.0, False)):
+        world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0})
+        world.table |= {"fine": nats(0.0), "fine+irf_tail+vignetting": nats(70.0 + finer)}
+        world.table |= {"fine+irf_tail": nats(40.0), "fine+vignetting": nats(30.0)}
+        assert world.criticise().final.fine is fine
+
+
+def test_numbers_of_single_spots_are_no_company(monkeypatch):
+    """They are asked for by themselves, after it."""
+    monkeypatch.setattr(loop, "solve", lambda *_: None)
+    world = hidden(monkeypatch, {"irf_tail": 40.0, "timing_jitter": 30.0}, timing_jitter=500.0)
+    found = world.criticise()
+    assert [t.best.name for t in found.accepted] == ["timing_jitter"]
+    both = hidden(
+        monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0, "timing_jitter": 20.0}, timing_jitter=500.0
+    )
+    found = both.criticise()
+    assert [t.best.name for t in found.accepted] == ["irf_tail", "vignetting", "timing_jitter"]
