@@ -18,7 +18,8 @@ OUTSIDE = {
     "SECURITY.md": "security.md",
     "benchmarks/NOTES.md": "benchmarks.md",
 }
-LINK = re.compile(r"\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+LINK = re.compile(r"\[([^\[\]]*)\]\(([^)\s#:]+)(#[^)\s]*)?\)")
+BEHIND = 0.2  # weight of the reference in a search
 ROLE = re.compile(r":(?:func|class|meth|mod|data|attr):<code>~?(?:[\w]+\.)*(\w+)</code>")
 
 
@@ -30,20 +31,26 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Let links lead to where their pages are in the site; what is not in it is only named."""
+    """Let links lead to where their pages are in the site; what is not in it is only named.
+
+    Names of the reference are found behind pages that explain: a search for a word means these.
+    """
+    if page.file.src_uri.startswith("reference/"):
+        page.meta.setdefault("search", {"boost": BEHIND})
     sources = {name: source for source, name in OUTSIDE.items()}
     here = sources.get(page.file.src_uri, f"docs/{page.file.src_uri}")
 
     def moved(match: re.Match[str]) -> str:
-        target = posixpath.normpath(posixpath.join(posixpath.dirname(here), match[1]))
+        text, named, anchor = match.groups()
+        target = posixpath.normpath(posixpath.join(posixpath.dirname(here), named))
         if target in OUTSIDE:
             inside = OUTSIDE[target]
         elif target.startswith("docs/") and not target.endswith(".jsonl"):
             inside = target.removeprefix("docs/")
         else:
-            return f"] ({target})"
+            return f"`{target}`" if text.endswith(posixpath.basename(target)) else f"{text} in `{target}`"
         start = posixpath.dirname(page.file.src_uri) or "."
-        return f"]({posixpath.relpath(inside, start)}{match[2] or ''})"
+        return f"[{text}]({posixpath.relpath(inside, start)}{anchor or ''})"
 
     return LINK.sub(moved, markdown)
 

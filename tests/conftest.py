@@ -1,15 +1,25 @@
-"""What every test shares: where the real captures lie, and a quiet machine."""
+"""What every test shares: where the real captures lie, a quiet machine, a browser."""
 
 from __future__ import annotations
 
 import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared" / "data"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+WITHOUT_GPU = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-sandbox",
+)
 
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
 
@@ -20,3 +30,16 @@ def real_file(name: str) -> Path:
     if not path.exists():
         pytest.skip(f"{name} is not beside this checkout (looked in ../shared/data)")
     return path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """An installed Chromium or Chrome, driven by playwright; skips the test where one of them is missing."""
+    play = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+    program = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if program is None:
+        pytest.skip("no Chromium or Chrome is installed")
+    with play.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=program, args=[*WITHOUT_GPU])
+        yield opened
+        opened.close()

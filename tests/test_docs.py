@@ -190,6 +190,17 @@ def test_prose_lines_are_readable(page):
     assert [f"{n}: {line[:60]}…" for n, line in prose(text) if len(line) > LONGEST] == []
 
 
+def test_the_readme_is_one_screen():
+    """A picture, two commands to begin with, five tasks of three commands at most."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 40
+    assert text.count("![") == 1
+    assert [line.split()[0] for line in text.splitlines() if line.startswith("    ")] == ["python3", "nlos"]
+    tasks = [line for line in text.splitlines() if line.startswith("| ") and "`nlos " in line]
+    assert len(tasks) == 5
+    assert all(1 <= len(re.findall("`nlos [^`]+`", task)) <= 3 for task in tasks)
+
+
 def test_the_citation_is_complete():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert {"cff-version", "message", "title", "authors", "type", "license"} <= set(cited)

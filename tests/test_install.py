@@ -10,6 +10,7 @@ import sys
 import tarfile
 import time
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -29,19 +30,30 @@ print(json.dumps({"conf": str(CONF), "scenes": scenes, "made": made, "others": o
 """
 
 
-def source(folder: Path) -> Path:
+SOURCE = (
+    *("nlos_lit", "data_modules", "conf"),
+    *("pyproject.toml", "setup.py", "README.md", "LICENSE", "MANIFEST.in", "Makefile", "train.py"),
+)
+
+
+def source(folder: Path, names: Iterable[str] = SOURCE) -> Path:
     """A copy of what a build reads, so that it leaves nothing in the checkout."""
-    for name in ("nlos_lit", "data_modules", "conf"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "setup.py", "README.md", "LICENSE", "MANIFEST.in", "Makefile", "train.py"):
-        shutil.copy(ROOT / name, folder)
+    for name in names:
+        if (ROOT / name).is_dir():
+            shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(ROOT / name, folder)
     return folder
+
+
+def outside() -> dict[str, str]:
+    """The environment without what would put the checkout in front of an installation."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 
 
 def python(*arguments: str, cwd: Path, path: Path | None = None) -> str:
     """What Python prints, outside the checkout, with an installation in front of all other packages."""
-    kept = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    env = kept if path is None else {**kept, "PYTHONPATH": str(path)}
+    env = outside() if path is None else {**outside(), "PYTHONPATH": str(path)}
     done = subprocess.run(
         [sys.executable, *arguments], cwd=cwd, env=env, capture_output=True, text=True, check=False
     )
@@ -83,6 +95,21 @@ def test_the_wheel_holds_every_file_of_the_packages(dist):
     assert wanted <= held
     assert {name.split("/")[0] for name in held if ".dist-info" not in name} == {"nlos_lit", "data_modules"}
     assert any(name.endswith("entry_points.txt") for name in held)
+
+
+def test_the_image_copies_what_a_build_needs(dist, tmp_path):
+    """Without Docker: what the Dockerfile copies and .dockerignore lets through gives the same wheel."""
+    lines = (ROOT / "Dockerfile").read_text(encoding="utf-8").splitlines()
+    copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
+    let_through = (ROOT / ".dockerignore").read_text(encoding="utf-8").split()
+    assert {f"!{name}" for name in copied} <= set(let_through)
+    assert "constraints.txt" in copied
+    folder = source(tmp_path, copied)
+    python("-c", "import setuptools.build_meta as b; b.build_wheel('.')", cwd=folder)
+    (mine,), (wheel,) = folder.glob("*.whl"), dist.glob("*.whl")
+    assert zipfile.ZipFile(mine).namelist() == zipfile.ZipFile(wheel).namelist()
+    assert "RUN pip install --no-cache-dir -c constraints.txt ." in lines
+    assert lines[-1] == 'ENTRYPOINT ["nlos"]'
 
 
 def test_the_source_archive_can_be_built(dist):
@@ -142,6 +169,6 @@ def test_a_fresh_environment_takes_wheel_and_source(dist, tmp_path):
         if again:
             subprocess.run(again, check=True)
         for words in (["--version"], simulate, ["look", "mine.hdf5"]):
-            subprocess.run([place / "nlos", *words], cwd=tmp_path, check=True)
+            subprocess.run([place / "nlos", *words], cwd=tmp_path, env=outside(), check=True)
         assert (tmp_path / "outputs" / "mine" / "look" / "look.png").exists()
         shutil.rmtree(tmp_path / "outputs")

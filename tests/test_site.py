@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
+import http.server
 import importlib.util
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 import yaml
@@ -14,12 +17,14 @@ from conftest import ROOT
 NEEDED = ("mkdocs", "material", "mkdocstrings")
 
 
-def test_the_site_builds_strictly(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         pytest.skip(f"{', '.join(missing)} not installed: pip install -c constraints.txt -e '.[docs]'")
+    folder = tmp_path_factory.mktemp("site")
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
@@ -28,12 +33,51 @@ def test_the_site_builds_strictly(tmp_path):
         check=False,
     )
     assert done.returncode == 0, done.stderr[-3000:]
-    reference = (tmp_path / "site" / "reference" / "capture.html").read_text(encoding="utf-8")
+    return folder
+
+
+def test_the_site_is_built(site):
+    reference = (site / "reference" / "capture.html").read_text(encoding="utf-8")
     assert "nlos_lit.capture.capture.Capture" in reference
     assert ":class:<code>" not in reference
-    assert 'href="../benchmarks.html"' in (tmp_path / "site" / "speed.html").read_text(encoding="utf-8") or (
-        'href="benchmarks.html"' in (tmp_path / "site" / "speed.html").read_text(encoding="utf-8")
-    )
+    assert 'href="benchmarks.html"' in (site / "speed.html").read_text(encoding="utf-8")
+    readme = (site / "readme.html").read_text(encoding="utf-8")
+    assert "<code>CITATION.cff</code>" in readme  # no page, so named and not linked
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    """Of the site, served as a web server does."""
+    handler = functools.partial(Quiet, directory=str(site))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
+@pytest.mark.parametrize(("word", "leads_to"), [("drift", "effects.html"), ("install", "how-to.html")])
+def test_a_word_is_found_by_the_search(address, browser, word, leads_to):
+    page = browser.new_page()
+    outside = []
+    page.on("request", lambda asked: None if asked.url.startswith(address) else outside.append(asked.url))
+    page.goto(f"{address}/index.html", wait_until="networkidle")
+    page.click(".md-search__input")
+    page.keyboard.insert_text(word[:-1])
+    page.keyboard.press(word[-1])  # the search listens to keys, and answers to each
+    page.wait_for_selector(".md-search-result__item a")
+    found = page.eval_on_selector_all(".md-search-result__item a", "links => links.map(link => link.href)")
+    first = [link.removeprefix(f"{address}/").split("?")[0].split("#")[0] for link in found[:8]]
+    assert leads_to in first
+    page.click(".md-search-result__item a")
+    page.wait_for_load_state()
+    assert word.lower() in page.inner_text("article").lower()
+    assert outside == []
+    page.close()
 
 
 def entries(menu: list) -> list[str]:

@@ -34,7 +34,7 @@ def rsd(
         wavelength: λ, m; None takes four spot spacings, as Liu et al. recommend at least two.
         cycles: σ_pf = cycles·λ/6, so that ±3 σ hold that many wavelengths.
         power: p of the intensity; the paper's Eq. 2 has 2.
-        depth_exponent: q.
+        depth_exponent: q of the intensity.
 
     Returns:
         ``[nz, nx, ny]`` float32 in 0 … 1.

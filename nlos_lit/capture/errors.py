@@ -37,13 +37,14 @@ class MemoryBudgetError(UserError, MemoryError):
     """A computation needs more memory than the budget allows."""
 
 
-def suggest(name: str, known: Iterable[str], listed: Iterable[str] | None = None) -> str:
+def suggest(name: str, known: Iterable[str], listed: Iterable[str] | None = None, above: str = "") -> str:
     """What to write instead of a name that does not exist, as the end of a sentence.
 
     Args:
         name: as it was given.
         known: the names there are.
         listed: what is told where none of them is near; None for all of them.
+        above: what stands before the nearest in the answer, such as their section.
 
     Returns:
         The nearest, or those listed.
@@ -57,5 +58,5 @@ def suggest(name: str, known: Iterable[str], listed: Iterable[str] | None = None
     names = list(known)
     close = difflib.get_close_matches(name, names, n=3)
     if close:
-        return f"did you mean {' or '.join(close)}?"
+        return f"did you mean {' or '.join(above + near for near in close)}?"
     return f"there are {', '.join(names if listed is None else listed)}"

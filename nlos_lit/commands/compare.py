@@ -9,9 +9,12 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime.command_line import as_typed
 from nlos_lit.training.sweep_table import run_rows, table
 
-ABOUT = """Runs side by side, where they differ and what came out: nlos compare RUN RUN …
+ABOUT = """Show where finished runs differ, and what came out.
 
-RUN is the folder of a finished run. Runs that differ in the seed alone are put together below."""
+    nlos compare RUN RUN …
+
+RUN is the folder of a finished run. A row is a run, the best last: its folder, the settings in which it
+differs from the others, its errors. Runs that differ in the seed alone are put together below."""
 
 
 def main(arguments: list[str]) -> int:

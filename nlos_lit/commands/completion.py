@@ -55,7 +55,8 @@ def main(arguments: list[str]) -> int:
     scripts = {"bash": bash, "zsh": zsh}
     if len(arguments) != 1 or arguments[0] not in scripts:
         found = " ".join(arguments)
-        print(f"error: name a shell; found {found!r}: {suggest(found, scripts)}", file=sys.stderr)
+        told = f"found {found!r}: {suggest(found, scripts)}" if found else f"there are {', '.join(scripts)}"
+        print(f"error: name a shell; {told}", file=sys.stderr)
         return 2
     print(scripts[arguments[0]]())
     return 0

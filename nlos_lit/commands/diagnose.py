@@ -30,6 +30,7 @@ from nlos_lit.runtime.command_line import (
     output_folder,
     quote_numbers,
     sentence_errors,
+    settings_as_words,
     stay_in_run,
     typed,
 )
@@ -156,10 +157,10 @@ def scene_settings(config: DictConfig, folder: Path) -> list[str]:
         folder: of the run.
 
     Returns:
-        settings of ``train.py``.
+        words of ``nlos train``.
     """
     given = HydraConfig.get().overrides.task if config.run is None else begun_with(folder)
-    return [item for item in given if item.startswith(("scene=", "scene."))]
+    return settings_as_words("train", [item for item in given if item.startswith(("scene=", "scene."))])
 
 
 def _undiagnosed(folder: Path) -> Run:

@@ -13,6 +13,11 @@ from nlos_lit.report.capture_figure import draw_capture
 from nlos_lit.runtime.command_line import typed
 
 LONGEST = 60  # characters of a capture's name that its picture's keeps: file names have room for 255 bytes
+AXES = {
+    "flip-x": "the file's x runs the other way",
+    "flip-y": "the file's y runs the other way",
+    "swap-xy": "the file's axes change places",
+}
 
 
 def main(arguments: list[str]) -> int:
@@ -52,7 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--format", default="auto", help=f"auto, or one of {', '.join(reader.NAME for reader in READERS)}"
     )
-    parser.add_argument("--bin-width-ps", type=float)
+    parser.add_argument("--bin-width-ps", type=float, metavar="PS", help="width of a time bin as recorded")
     parser.add_argument(
         "--wall-size",
         type=float,
@@ -62,8 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--t-start", type=float, metavar="M", help="path at the start of bin 0, m")
     parser.add_argument("--gate", type=int, nargs=2, metavar=("FIRST", "LAST"), help="bins to fit")
-    for name in ("flip-x", "flip-y", "swap-xy"):
-        parser.add_argument(f"--{name}", action="store_true", default=None)
+    for name, told in AXES.items():
+        parser.add_argument(f"--{name}", action="store_true", default=None, help=told)
     parser.add_argument(
         "--raw-scale", action=argparse.BooleanOptionalAction, help="the file carries tal's raw scale, or not"
     )

@@ -19,7 +19,7 @@ from nlos_lit.commands.plan import plan
 from nlos_lit.report.capture_figure import draw_capture
 from nlos_lit.report.fronts import View, front_views
 from nlos_lit.report.style import save_figure
-from nlos_lit.runtime.command_line import as_typed, sentence_errors, typed, words_as_settings
+from nlos_lit.runtime.command_line import as_typed, sentence_errors, settings_as_words, typed
 from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.training.configs import compose
 
@@ -144,7 +144,5 @@ def _scene(measured: Measurement, settings: list[str]) -> list[str]:
 
 
 def _command(name: str, measured: Measurement, settings: list[str]) -> str:
-    words = [str(measured.path), *settings]
-    if words_as_settings(name, words) != _scene(measured, settings):  # such as a file's name with a =
-        words = _scene(measured, settings)
+    words = settings_as_words(name, _scene(measured, settings))
     return " ".join([typed(name), *map(shlex.quote, words)])

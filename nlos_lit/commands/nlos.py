@@ -150,8 +150,11 @@ def open_command(name: str, arguments: list[str]) -> int:
         return 2
     if command.settings:
         from nlos_lit.runtime.arguments import look_over
-        from nlos_lit.runtime.command_line import sentence_errors, words_as_settings
+        from nlos_lit.runtime.command_line import OF_CAPTURES, sentence_errors, typed, words_as_settings
 
+        if name in OF_CAPTURES and not arguments:
+            yours = f"{typed(name)} FILE"
+            print(f"no capture is named: this is the scene that is built in; for yours, {yours}", flush=True)
         arguments = sentence_errors(words_as_settings)(name, arguments)
         look_over(name, arguments, command.about)
     module = importlib.import_module(f"nlos_lit.commands.{command.module or name}")

@@ -39,12 +39,16 @@ def page_of(run: Path) -> Path:
         ``explore.html``.
 
     Raises:
-        UserError: the folder holds nothing to look at, or links out of it.
+        UserError: it is no folder, or one that holds nothing to look at, or links out of it.
     """
     from nlos_lit.report.explore import FILE as PAGE  # after the arguments: it loads torch
     from nlos_lit.report.explore import write_page
     from nlos_lit.training.explored import keep
 
+    if run.is_file():
+        raise UserError(
+            f"{run} is a file; give the folder that a train or diagnose command has named at its end"
+        )
     refuse_links(run)
     folder = run / "diagnosis" if (run / "diagnosis" / VIEW).is_file() else run
     view = read_view(folder)

@@ -57,8 +57,8 @@ class CriticismSettings:
         most_of: share of the best gain from which on a simpler term goes before that with the best …
         odds: … as it does if its weight is this much of the best's.
         most: terms that are accepted at most.
-        toys: simulated captures for the null distribution. processes: that work on them; rebuilds that go on
-            side by side.
+        toys: simulated captures for the null distribution.
+        processes: that work on them; rebuilds that go on side by side.
     """
 
     spots: int = 1024

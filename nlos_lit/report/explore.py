@@ -249,7 +249,8 @@ def _change(view: View) -> str:
     return _section(
         "Before and after the diagnosis",
         "<p>How many standard deviations the counts lie above the simulation: as it was, and with what the "
-        "diagnosis added. Within the grey band lies chance.</p>"
+        "diagnosis added. Of curves, what lies within the grey band is chance; on the wall, grey spots were "
+        "kept back.</p>"
         '<div class="plot" id="change" role="group" aria-label="Residual before and after the extension '
         'along the chosen axis."></div>'
         f'<div class="controls"><label>residual <select id="profile">{options}</select></label></div>',

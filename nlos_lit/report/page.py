@@ -43,7 +43,8 @@ CAPTIONS = {
     "residual_time": "Residual along time, all spots together: how many standard deviations the counts lie"
     " above the simulation.",
     "residual_depth": "Residual along depth.",
-    "residual_wall": "Residual over the wall, as seen from the wall.",
+    "residual_wall": "Residual over the wall, as seen from the wall. Grey spots were kept back to score the"
+    " last model only.",
     "residual_scan": "Residual in the order in which the spots were recorded.",
     "residual_rate": "Residual against how bright a spot is.",
     "deviance": "Misfit after each accepted effect or free term, and on spots that nothing was chosen with."

@@ -27,6 +27,7 @@ from nlos_lit.places import CONF
 from nlos_lit.runtime.command_line import as_typed, output_folder
 from nlos_lit.runtime.hooks import take_hooks
 from nlos_lit.runtime.keys import FOREIGN_SECTIONS, KEYS
+from nlos_lit.runtime.meanings import meanings
 
 OF_HYDRA = ("hydra", "profile")
 RESUME = "resume"  # of train.py, and no key of its config: what was begun is read from that folder
@@ -199,7 +200,7 @@ def _instead(key: str, known: Iterable[str]) -> str:
     start = f"{section}." if section else ""
     beside = dict.fromkeys(other[len(start) :].split(".")[0] for other in known if other.startswith(start))
     if section and beside:
-        return suggest(name, beside)
+        return suggest(name, beside, above=start)
     return suggest(
         key, dict.fromkeys([*known, *beside]), dict.fromkeys(other.split(".")[0] for other in known)
     )
@@ -302,34 +303,17 @@ def help_of(command: str, about: str) -> str:
     Returns:
         Text of many lines.
     """
-    lines, meaning = [about.strip()], {}
+    lines = [about.strip()]
     config = CONF / f"{command}.yaml"
     if config.exists():
-        base = comments(CONF / "scene" / "_base.yaml")
-        meaning = comments(config) | {f"scene.{key}": told for key, told in base.items()}
         head = [line[2:] for line in config.read_text(encoding="utf-8").splitlines() if line[:2] == "# "]
         lines += ["", *(f"  {line}" for line in head), "", "Choices, GROUP=NAME:"]
         lines += [f"  {group:12s} {', '.join(names)}" for group, names in groups_of(command).items()]
         lines += ["", "Also --multirun (-m) for sweeps, --cfg job for the values, --hydra-help."]
     if command in KEYS:
         lines += ["", "Settings, KEY=VALUE (lists in quotes: 'KEY=[1,2]'):"]
+        meaning = meanings(command)
     for key, rule in KEYS.get(command, {}).items():
-        lines.append(f"  {key}: {rule}" + (f"  # {meaning[key]}" if key in meaning else ""))
+        told = meaning.get(key, meaning.get(key.rpartition(".")[0]))  # or what is said of its section
+        lines.append(f"  {key}: {rule}" + (f"  # {told}" if told else ""))
     return as_typed("\n".join(lines))
-
-
-def comments(file: Path) -> dict[str, str]:
-    """Dotted key → the comment behind it, of a YAML file."""
-    found, above = {}, [(-1, "")]
-    for line in file.read_text(encoding="utf-8").splitlines():
-        match = re.match(r"( *)(\w+):(.*)$", line)
-        if not match:
-            continue
-        indent, name, rest = len(match[1]), match[2], match[3]
-        while above[-1][0] >= indent:
-            above.pop()
-        key = f"{above[-1][1]}{name}"
-        above.append((indent, f"{key}."))
-        if "# " in rest:
-            found[key] = rest.partition("# ")[2].strip()
-    return found

@@ -54,7 +54,7 @@ def typed(command: str) -> str:
 def this_command() -> str:
     """The command that this process carries out, to be typed again."""
     name = os.environ.get(STARTED) or Path(sys.argv[0]).stem
-    return " ".join([typed(name), *map(shlex.quote, sys.argv[1:])])
+    return " ".join([typed(name), *map(shlex.quote, settings_as_words(name, sys.argv[1:]))])
 
 
 def as_typed(text: str) -> str:
@@ -169,8 +169,12 @@ def words_as_settings(command: str, arguments: list[str]) -> list[str]:
         path = first[0]
         if not os.path.exists(path):
             raise UserError(f"{path} does not exist; give a capture file, or settings KEY=VALUE: --help")
-        is_run = command == "diagnose" and os.path.exists(os.path.join(path, "config.yaml"))
-        first = [f"run={quoted(path)}"] if is_run else ["scene=capture", f"scene.path={quoted(path)}"]
+        is_run = os.path.exists(os.path.join(path, "config.yaml"))
+        if command == "diagnose" and is_run:
+            first = [f"run={quoted(path)}"]
+        else:
+            _refuse_folder(command, path, is_run)
+            first = ["scene=capture", f"scene.path={quoted(path)}"]
     if command != "diagnose":
         return first + rest
     found, words = [], iter(first + rest)
@@ -183,6 +187,42 @@ def words_as_settings(command: str, arguments: list[str]) -> list[str]:
             word = f"split_with={quoted(file)}"
         found.append(word)
     return found
+
+
+def _refuse_folder(command: str, path: str, is_run: bool) -> None:
+    """Refuse a folder in which no reader would look for a capture."""
+    if not os.path.isdir(path) or any(name.endswith(".mat") for name in os.listdir(path)):
+        return
+    if command == "train" and is_run:
+        instead = f"to go on with that run say resume={path}"
+    else:
+        instead = "give a capture file" + (", or a finished run's folder" if command == "diagnose" else "")
+    raise UserError(f"{path} is a folder without a capture (no .mat file is in it); {instead}")
+
+
+def settings_as_words(command: str, settings: list[str]) -> list[str]:
+    """The inverse of :func:`words_as_settings`: a capture's file by itself, where that says the same.
+
+    Args:
+        command: as ``nlos`` names it.
+        settings: that Hydra reads; of a capture's file they begin as that function made them.
+
+    Returns:
+        Words of a command line.
+
+    Examples:
+        >>> settings_as_words("train", ["scene=capture", f"scene.path={quoted(__file__)}"]) == [__file__]
+        True
+        >>> settings_as_words("train", ["scene=su", "seed=1"])
+        ['scene=su', 'seed=1']
+    """
+    if settings[:1] == ["scene=capture"] and settings[1:] and settings[1].startswith("scene.path="):
+        value = settings[1].removeprefix("scene.path=")
+        path = re.sub(r"\\(.)", r"\1", value[1:-1]) if value.startswith("'") else value
+        words = [path, *settings[2:]]
+        if os.path.exists(path) and words_as_settings(command, words) == settings:
+            return words
+    return settings
 
 
 def quote_numbers(arguments: list[str]) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from nlos_lit.runtime.schema import (
     FILE,
     FLAG,
-    FOREIGN,
     NAME,
     SETTINGS,
     SIZE,
@@ -257,7 +256,7 @@ METHOD: dict[str, Rule] = {
 }
 SIMULATE: dict[str, Rule] = {
     "scene": word(*MESHES, "mesh", "two_albedo"),
-    "bodies": optional(FOREIGN),
+    "bodies": optional(either(many(SETTINGS), SETTINGS)),
     "random": optional(whole(0)),
     "mesh": optional(FILE),
     "out": optional(TEXT),

@@ -149,4 +149,3 @@ NAME = Rule(  # numbers are names, too: scene 34
 FILE = Rule("a file or folder that is there", lambda value: isinstance(value, str) and os.path.exists(value))
 SIZE = Rule("a size such as 8GiB or 500MB", _is_size)
 SETTINGS = Rule("KEY: VALUE pairs", lambda value: isinstance(value, dict))
-FOREIGN = Rule("what the class takes that the section names", lambda value: True)

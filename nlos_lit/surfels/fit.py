@@ -43,17 +43,19 @@ class SurfelSettings:
         most: … and division leaves no more surfels than this.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
-        rounds: between rounds surfels die, grow and are hidden anew. steps: batches a round; the last has
-            twice as many.
+        rounds: between rounds surfels die, grow and are hidden anew.
+        steps: batches a round; the last has twice as many.
         more: last rounds that may follow, in some of which surfels are divided, see
             :meth:`SurfelFit.schedule`.
         batch: spots a step.
-        depth_rate: of Adam, in bins there and back. side_rate: in cells, of places in the surfel's own plane;
-            0 leaves them in the middle of their cells. albedo_rate, response_rate: of the unconstrained
-            values. effect_rate: of physical effects, in their own noticeable steps.
-        bending: weight of :meth:`SurfelModel.bending`; 1 takes it for the logarithm of a prior.
-        evenness: weight of :meth:`SurfelModel.albedo_steps`.
-        brightness: weight of :meth:`SurfelModel.brightness`.
+        depth_rate: of Adam, in bins there and back.
+        side_rate: in cells, of places in the surfel's own plane; 0 leaves them in the middle of their cells.
+        albedo_rate, response_rate: of the unconstrained values.
+        effect_rate: of physical effects, in their own noticeable steps.
+        bending: weight against neighbours that do not fit one surface (:meth:`SurfelModel.bending`); 1 takes
+            it for the logarithm of a prior.
+        evenness: weight against albedos that differ between neighbours (:meth:`SurfelModel.albedo_steps`).
+        brightness: weight against albedos beyond the scene's own level (:meth:`SurfelModel.brightness`).
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.

@@ -41,7 +41,7 @@ ERRORS = {
 # Sections of a config that say where and how a run is kept, or repeat what a name says.
 NOT_SETTINGS = ("folder", "callbacks", "logger", "trainer.default_root_dir", "ablation.optimise", "ckpt_path")
 ALONE = {"scene.name": "scene", "ablation.name": "ablation", "method.name": "method"}
-SEEDS = "seeds"
+RUN, SEEDS = "run", "seeds"
 
 
 class SweepTable(Callback):
@@ -89,7 +89,7 @@ def told_runs(folders: Sequence[Path]) -> list[ToldRun]:
 
 
 def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
-    """A row a run: where it differs from the others, and its errors; the best last, as in Table 1.
+    """A row a run: its folder, where it differs from the others, its errors; the best last, as in Table 1.
 
     Errors that no run has (geometry without a truth) are left out.
 
@@ -97,7 +97,7 @@ def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
         folders: of finished runs.
 
     Returns:
-        column → value; settings come first.
+        column → value; the folder's name comes first (its whole path where two have the same), then settings.
 
     Raises:
         UserError: a folder holds no finished run.
@@ -108,7 +108,13 @@ def run_rows(folders: Sequence[Path]) -> list[dict[str, Any]]:
 def rows_of(runs: Sequence[ToldRun]) -> list[dict[str, Any]]:
     """The rows of :func:`run_rows`."""
     known = [column for column in ERRORS if any(run.errors[column] is not None for run in runs)]
-    rows = [{**run.settings, **{column: run.errors[column] for column in known}} for run in runs]
+    names = [run.folder.resolve().name for run in runs]
+    if len(set(names)) < len(names):
+        names = [str(run.folder) for run in runs]
+    rows = [
+        {RUN: name, **run.settings, **{column: run.errors[column] for column in known}}
+        for name, run in zip(names, runs, strict=True)
+    ]
     order = [run.errors["MSE transient (held out)"] or run.errors["NMSE"] or math.inf for run in runs]
     return [row for _, row in sorted(zip(order, rows, strict=True), key=lambda pair: -pair[0])]
 
@@ -177,13 +183,13 @@ def over_seeds(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """
     groups: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for row in rows:
-        named = {key: row[key] for key in row if key not in ERRORS and key != "seed"}
+        named = {key: row[key] for key in row if key not in (*ERRORS, RUN, "seed")}
         groups.setdefault(tuple((key, repr(value)) for key, value in named.items()), []).append(row)
     if max((len(group) for group in groups.values()), default=0) < 2:
         return []
     told = []
     for group in groups.values():
-        row = {key: value for key, value in group[0].items() if key not in ERRORS and key != "seed"}
+        row = {key: value for key, value in group[0].items() if key not in (*ERRORS, RUN, "seed")}
         row[SEEDS] = len(group)
         for column in (column for column in ERRORS if column in group[0]):
             values = [each[column] for each in group if each[column] is not None]

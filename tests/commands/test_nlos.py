@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import pytest
 from conftest import ROOT
@@ -11,7 +12,8 @@ from conftest import ROOT
 from nlos_lit.commands import nlos
 from nlos_lit.commands.completion import bash, words_of, zsh
 from nlos_lit.commands.completion import main as completion
-from nlos_lit.commands.nlos import COMMANDS, STARTED, main
+from nlos_lit.commands.nlos import COMMANDS, STARTED, main, open_command
+from nlos_lit.commands.view import main as view
 from nlos_lit.runtime import command_line
 from nlos_lit.runtime.command_line import as_typed, typed
 
@@ -100,7 +102,23 @@ def test_zsh_reads_the_completion(capsys):
     subprocess.run(["zsh", "-n"], input=zsh(), text=True, check=True)
 
 
+def test_a_command_without_a_capture_says_what_it_works_on(capsys, monkeypatch):
+    monkeypatch.setattr(nlos.importlib, "import_module", lambda name: SimpleNamespace(main=lambda words: 0))
+    assert open_command("reconstruct", []) == 0
+    assert "no capture is named: this is the scene that is built in" in capsys.readouterr().out
+    assert open_command("reconstruct", ["scene=su"]) == 0
+    assert capsys.readouterr().out == ""
+
+
+def test_a_file_is_no_run(tmp_path, capsys):
+    (tmp_path / "mine.mat").touch()
+    assert view([str(tmp_path / "mine.mat")]) == 2
+    assert "mine.mat is a file; give the folder that" in capsys.readouterr().err
+
+
 def test_completion_names_the_shells(capsys):
+    assert completion([]) == 2
+    assert capsys.readouterr().err == "error: name a shell; there are bash, zsh\n"
     assert completion(["bsh"]) == 2
     assert "did you mean bash" in capsys.readouterr().err
     assert completion(["--help"]) == 0

@@ -6,7 +6,6 @@ Needs the package playwright and an installed Chromium or Chrome; skipped where 
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,16 +20,6 @@ from nlos_lit.io.views import read_view, write_view
 from nlos_lit.report.explore import write_page
 from nlos_lit.report.page import report_html
 
-playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
-CHROMIUM = next(
-    filter(
-        None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"))
-    ),
-    None,
-)
-if CHROMIUM is None:
-    pytest.skip("no Chromium or Chrome is installed", allow_module_level=True)
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-sandbox"]
 DESKTOP, PHONE = {"width": 1366, "height": 900}, {"width": 390, "height": 844}
 READY = "body[data-ready]"
 
@@ -42,14 +31,6 @@ def folder(tmp_path_factory) -> Path:
     write_page(folder, read_view(folder))
     write_page(folder / "begun", irregular())
     return folder
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as play:
-        opened = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield opened
-        opened.close()
 
 
 @pytest.fixture(scope="module")
@@ -192,6 +173,17 @@ def test_layers_slices_and_before_and_after(page, folder):
     lines = page.evaluate("document.getElementById('change').data.map(t => t.y)")
     time = next(p for p in kept.facts["profiles"] if p["axis"] == "time")
     assert lines == [time["before"], time["after"]]
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])
+def test_names_of_curves_stand_above_them(browser, folder, size):
+    opened, _ = shown(browser, folder / "explore.html", size)
+    low, high = opened.evaluate(
+        """() => [document.querySelector("#transient .legend").getBoundingClientRect().bottom,
+            document.querySelector("#transient .nsewdrag").getBoundingClientRect().top]"""
+    )
+    assert low <= high + 1
+    opened.close()
 
 
 @pytest.mark.parametrize("size", [DESKTOP, PHONE], ids=["desktop", "phone"])

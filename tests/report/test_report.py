@@ -136,6 +136,7 @@ def test_json_is_the_diagnosis(written, case):
             "formula",
             "needed",
             "tried",
+            "explained",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
         assert set(effect["heldout_gain"]) == {

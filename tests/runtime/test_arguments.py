@@ -22,6 +22,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime import arguments, keys
 from nlos_lit.runtime.arguments import begun, check_assignments, check_overrides, look_over
 from nlos_lit.runtime.keys import KEYS
+from nlos_lit.runtime.meanings import meanings
 from nlos_lit.runtime.schema import Rule
 from nlos_lit.training.configs import compose
 
@@ -55,17 +56,17 @@ MISTAKES = [
     ("logger=tensorbord", f"there is no logger=tensorbord; {NEAR} tensorboard"),
     ("ablation=phazor", f"there is no ablation=phazor; {NEAR} phasor"),
     ("experiment=zzz", "there is no experiment=zzz; there are evidence, evidence_reduced, quick"),
-    ("scene.itrations=5", f"no key scene.itrations; {NEAR} iterations"),
-    ("scene.volume.deph=[1,2]", f"no key scene.volume.deph; {NEAR} depth"),
-    ("+scene.volume.deph=[1,2]", f"no key scene.volume.deph; {NEAR} depth"),
+    ("scene.itrations=5", f"no key scene.itrations; {NEAR} scene.iterations"),
+    ("scene.volume.deph=[1,2]", f"no key scene.volume.deph; {NEAR} scene.volume.depth"),
+    ("+scene.volume.deph=[1,2]", f"no key scene.volume.deph; {NEAR} scene.volume.depth"),
     ("scenes.iterations=5", f"no key scenes.iterations; {NEAR} scene.iterations"),
-    ("trainer.precison=16", f"no key trainer.precison; {NEAR} precision"),
+    ("trainer.precison=16", f"no key trainer.precison; {NEAR} trainer.precision"),
     ("modell.rays=20", f"no key modell.rays; {NEAR} model.rays"),
     (
         "+zzzz=1",
         r"there is no key zzzz; there are seed, threads, data_dir, memory_budget, force, scene, model",
     ),
-    ("~scene.iteration", f"no key scene.iteration; {NEAR} iterations"),
+    ("~scene.iteration", f"no key scene.iteration; {NEAR} scene.iterations"),
     ("scene.iterations=-5", "scene.iterations must be a whole number from 1 to 10000000; found -5"),
     ("scene.iterations=0", "found 0"),
     ("scene.iterations=1.5", "found 1.5"),
@@ -252,7 +253,7 @@ def test_files_of_conf_are_held_to_the_rules_too(tmp_path, monkeypatch):
 
     for key, value, sentence in [
         ("scene.volume.depth", [2, 1], "scene.volume.depth must be"),
-        ("scene.volumes", 3, f"there is no key scene.volumes; {NEAR} volume"),
+        ("scene.volumes", 3, f"there is no key scene.volumes; {NEAR} scene.volume"),
         ("scene.volume", 3, "there is no key scene.volume"),
         ("seed", "${nowhere}", "the config cannot be put together: .*nowhere"),
         ("scene.name", "???", "scene.name is not set; it must be a name"),
@@ -280,9 +281,10 @@ def run(*words: str) -> subprocess.CompletedProcess:
             "train",
             "scene.threshold: a number above 0 to below 1  # intensity below which there is no surface",
         ),
-        ("diagnose", "criticism.level: a number above 0 to below 1"),
+        ("diagnose", "criticism.processes: a whole number from 1 to 1024  # that work on them; rebuilds"),
+        ("reconstruct", "method.options.snr: a number above 0 to 1e+12  # power of the signal over"),
         ("reconstruct", "  method       bp, dlct, fbp, fk, lct, rsd"),
-        ("simulate", "  nx: a whole number from 1 to 10000"),
+        ("simulate", "  nx: a whole number from 1 to 10000  # grid points along x and y"),
         ("results", "size=full|reduced"),
     ],
 )
@@ -300,6 +302,21 @@ def test_a_name_that_is_no_text_is_one_sentence(capsys):
     assert (
         said == "error: cannot use scene.path=a\\udcff\\x1b[2J.mat: it is no text in UTF-8; rename the file\n"
     )
+
+
+@pytest.mark.parametrize("command", KEYS)
+def test_help_says_what_settings_mean(command):
+    """All but those of Lightning's Trainer, which are explained there, and names that say it."""
+    told = meanings(command)
+    plain = {"ablation.name", "method.name", "scene.source", "optimizer.method"}
+    silent = [
+        key
+        for key in KEYS[command]
+        if not (key in told or key.rpartition(".")[0] in told or key in plain)
+        and not key.startswith(("trainer.", "ablation.optimise."))
+    ]
+    assert silent == []
+    assert [text for text in told.values() if ":class:" in text or "``" in text or "\n" in text] == []
 
 
 def test_a_missing_path_is_said_before_the_libraries_are_loaded(tmp_path):

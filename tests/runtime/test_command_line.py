@@ -4,7 +4,7 @@ import pytest
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.runtime.arguments import check_overrides
-from nlos_lit.runtime.command_line import sentence_errors, words_as_settings
+from nlos_lit.runtime.command_line import quoted, sentence_errors, settings_as_words, words_as_settings
 from nlos_lit.training.configs import compose
 
 
@@ -44,6 +44,7 @@ def test_a_file_is_taken_as_it_is(tmp_path):
     check_overrides("train", ["scene=capture", own, "seed=1"])
     assert compose("train", ["scene=capture", own])["scene"]["path"] == str(file)
     assert words_as_settings("diagnose", [str(run)]) == [f"run={run}"]
+    assert settings_as_words("train", ["scene=capture", own, "seed=1"]) == [str(file), "seed=1"]
     split = words_as_settings(
         "diagnose", [str(run), f"--split-with={run}", "scene.reader.scan_order=columns"]
     )
@@ -52,5 +53,23 @@ def test_a_file_is_taken_as_it_is(tmp_path):
     assert words_as_settings("simulate", ["mine.mat"]) == ["mine.mat"]
     with pytest.raises(UserError, match=r"nowhere.mat does not exist; give a capture file, or settings"):
         words_as_settings("train", ["nowhere.mat"])
+    held = tmp_path / "holds no capture"
+    held.mkdir()
+    for command, folder, instead in (
+        ("train", held, "give a capture file$"),
+        ("diagnose", held, "give a capture file, or a finished run's folder$"),
+        ("train", run, f"to go on with that run say resume={run}$"),
+    ):
+        with pytest.raises(UserError, match=f"is a folder without a capture .*; {instead}"):
+            words_as_settings(command, [str(folder)])
     with pytest.raises(UserError, match="--split-with needs a capture file behind it"):
         words_as_settings("diagnose", [str(run), "--split-with"])
+
+
+@pytest.mark.parametrize("name", ["a=b.mat", "-a.mat", "+a.mat", "gone.mat"])
+def test_a_file_that_cannot_stand_alone_keeps_its_setting(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    if name != "gone.mat":
+        (tmp_path / name).touch()
+    settings = ["scene=capture", f"scene.path={quoted(name)}", "seed=1"]
+    assert settings_as_words("train", settings) == settings

@@ -58,7 +58,8 @@ def folders(sweep):
 
 def test_columns_are_what_differs(sweep):
     rows = run_rows(folders(sweep))
-    assert list(rows[0])[:4] == ["seed", "scene.threshold", "ablation", "MSE transient (held out)"]
+    assert list(rows[0])[:5] == ["run", "seed", "scene.threshold", "ablation", "MSE transient (held out)"]
+    assert [row["run"] for row in rows] == ["2", "1", "0"]
     assert [row["MSE transient (held out)"] for row in rows] == [0.7, 0.6, 0.4]  # the best last
     assert [(row["scene.threshold"], row["depth, median (m)"]) for row in rows] == [
         (0.2, 0.05),
@@ -86,7 +87,7 @@ def test_an_ablation_is_one_column(tmp_path):
     for ablation in ("all", "phasor"):
         run(tmp_path / ablation, 0.5, f"ablation={ablation}")
     rows = run_rows(folders(tmp_path))
-    assert [next(iter(row.items())) for row in rows] == [("ablation", "all"), ("ablation", "phasor")]
+    assert [list(row.items())[1] for row in rows] == [("ablation", "all"), ("ablation", "phasor")]
     assert "depth, median (m)" not in rows[0]
 
 
@@ -94,7 +95,7 @@ def test_any_runs_are_compared(sweep, capsys, tmp_path):
     two = [str(folder) for folder in folders(sweep)[1:]]
     assert compare(two) == 0
     told = capsys.readouterr().out
-    assert told.startswith("| seed | scene.threshold | ablation | MSE transient (held out) |")
+    assert told.startswith("| run | seed | scene.threshold | ablation | MSE transient (held out) |")
     assert len(told.splitlines()) == 4
     for words, sentence in [
         ([two[0]], "error: give the folders of two runs or more; found "),
@@ -103,7 +104,12 @@ def test_any_runs_are_compared(sweep, capsys, tmp_path):
         assert compare(words) == 2
         assert sentence in capsys.readouterr().err
     assert compare(["--help"]) == 0
-    assert capsys.readouterr().out.startswith("Runs side by side, where they differ")
+    assert capsys.readouterr().out.startswith("Show where finished runs differ")
+
+
+def test_runs_that_differ_in_nothing_are_told_by_their_folders(tmp_path):
+    alike = [run(tmp_path / day / "run", error, "seed=0") for day, error in (("a", 0.4), ("b", 0.5))]
+    assert [row["run"] for row in run_rows(alike)] == [str(alike[1]), str(alike[0])]
 
 
 def test_a_sweep_is_one_picture(sweep, tmp_path):
