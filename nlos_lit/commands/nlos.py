@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import os
+import select
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import ParamSpec
 
 import nlos_lit
 from nlos_lit.places import STARTED
@@ -39,6 +43,7 @@ class Command:
         return f"{self.does[0].upper()}{self.does[1:]}." + (f"\n\n{self.more.rstrip()}" if self.more else "")
 
 
+P = ParamSpec("P")
 SIMULATE = """\
 Writes OUT, a y-tal HDF5 capture, and OUT's name with _truth.h5: depth, normals and albedo as seen from the
 wall, and the mesh. A scene of one's own: 'bodies=[{kind: cone, at: [0, 0, 0.6]}]'; one drawn at random:
@@ -105,6 +110,35 @@ COMMANDS = MappingProxyType(
 )
 
 
+def for_readers(command: Callable[P, int]) -> Callable[P, int]:
+    """End without a word where whoever reads what is printed has read enough: ``nlos train --help | head``.
+
+    Args:
+        command: returns the exit status.
+
+    Returns:
+        the same; 141 where the reader has gone, as of programs that SIGPIPE ends.
+    """
+
+    @functools.wraps(command)
+    def wrapped(*given: P.args, **named: P.kwargs) -> int:
+        try:
+            try:
+                return command(*given, **named)
+            finally:
+                sys.stdout.flush()
+        except BrokenPipeError:
+            out, readers = sys.stdout.fileno(), select.poll()
+            readers.register(out, select.POLLOUT)
+            if not any(event & select.POLLERR for _, event in readers.poll(0)):
+                raise  # it was another pipe
+            os.dup2(os.open(os.devnull, os.O_WRONLY), out)
+            return 141
+
+    return wrapped
+
+
+@for_readers
 def main(arguments: list[str] | None = None) -> int:
     """Run a command.
 
@@ -133,6 +167,7 @@ def main(arguments: list[str] | None = None) -> int:
     return open_command(name, given[1:])
 
 
+@for_readers
 def open_command(name: str, arguments: list[str]) -> int:
     """Load a command and run it.
 

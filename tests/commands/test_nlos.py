@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -112,7 +114,9 @@ def test_a_command_without_a_capture_says_what_it_works_on(capsys, monkeypatch):
 
 def test_a_file_is_no_run(tmp_path, capsys):
     (tmp_path / "mine.mat").touch()
-    assert view([str(tmp_path / "mine.mat")]) == 2
+    with pytest.raises(SystemExit) as end:
+        view([str(tmp_path / "mine.mat")])
+    assert end.value.code == 2
     assert "mine.mat is a file; give the folder that" in capsys.readouterr().err
 
 
@@ -122,3 +126,15 @@ def test_completion_names_the_shells(capsys):
     assert completion(["bsh"]) == 2
     assert "did you mean bash" in capsys.readouterr().err
     assert completion(["--help"]) == 0
+
+
+@pytest.mark.parametrize("words", ["--help", "look --help", "train --help"])
+def test_a_reader_who_has_read_enough_ends_it_without_a_word(words):
+    """A pipe that nobody reads, as behind ``| head`` once that has gone."""
+    code = "import sys; from nlos_lit.commands.nlos import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, *words.split()]
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
