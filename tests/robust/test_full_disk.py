@@ -80,7 +80,7 @@ def test_a_full_disk_leaves_the_old_file_and_nothing_else(tmp_path):
     assert {file.read_text() for file in tmp_path.iterdir()} == {"old"}
 
 
-@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.ENOTDIR])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.ENOTDIR, errno.EEXIST])
 def test_what_the_disk_refuses_is_one_sentence_with_the_file(tmp_path, capsys, code):
     @sentence_errors
     def command() -> None:

@@ -322,6 +322,11 @@ def test_a_trainer_as_the_config_says(tmp_path):
     [
         (["+trainer.nothing=1"], "trainer has no argument 'nothing'; .*takes .*precision"),
         (["trainer.precision=nothing"], "Trainer cannot be made: .*nothing"),
+        pytest.param(
+            ["trainer=gpu"],
+            "Trainer cannot be made: No supported gpu",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has what is asked for"),
+        ),
         (["+trainer.callbacks=[]"], "trainer.callbacks is not read"),
         (["+callbacks.figures.size=3"], "callbacks.figures has no argument 'size'"),
         (["+logger.tensorboard.nothing._target_=os.system"], "nothing._target_=os.system is not built"),
