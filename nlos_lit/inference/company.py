@@ -56,7 +56,7 @@ def in_company(loop: Loop, turn: Turn, coarse: SurfelFit, fine: SurfelFit) -> Co
         coarse = loop.again(turn.best)
         if len(coarse.extension.effects) >= loop.settings.most:
             break
-        turn = loop.turn(coarse, fine)
+        turn = loop.turn(coarse, None)  # the misfit holds what hides it
     if len(members) < 2:
         return None
     select = loop.split.select

@@ -307,12 +307,13 @@ class Loop:
         self.seed, self.steps, self.number = seed, steps, 0
         self.block = split.block[split.select]
 
-    def turn(self, fit: SurfelFit, fine: SurfelFit) -> Turn:
+    def turn(self, fit: SurfelFit, fine: SurfelFit | None) -> Turn:
         """Ask the pool, go on with its leaders, choose.
 
         Args:
             fit: with the terms accepted so far.
-            fine: the fine scene with these terms.
+            fine: the fine scene with these terms, a share of whose misfit leaders must exceed; None asks for
+                no share.
 
         Returns:
             the turn, not confirmed yet; its ``best`` is None where nothing is asked for.
@@ -323,7 +324,8 @@ class Loop:
         candidates = self.steps(
             "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
         )
-        misfit = self._misfit(fine, self.split.fit)  # before it is in the model, a term is part of it itself
+        # Before it is in the model, a term is part of the misfit of other spots itself.
+        misfit = 0.0 if fine is None else self._misfit(fine, self.split.fit)
         bars = {c.name: needed(candidates, s, misfit, c.lit) for c in candidates}
         asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
         turn = Turn(candidates, needed(candidates, s, misfit), asked)
