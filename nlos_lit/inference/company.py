@@ -41,7 +41,7 @@ def in_company(loop: Loop, turn: Turn, coarse: SurfelFit, fine: SurfelFit) -> Co
         fine: the fine scene without the turn's term.
 
     Returns:
-        Two terms or more; None where there are fewer.
+        What holds; None where nothing does, or where no other term came to the first.
     """
     members: list[Turn] = []
     turn = replace(turn, confirmed=None, refused={})
@@ -62,7 +62,7 @@ def in_company(loop: Loop, turn: Turn, coarse: SurfelFit, fine: SurfelFit) -> Co
     select = loop.split.select
     grown = loop.fine(coarse, f"with_company_{loop.number}")
     scene = max((grown, coarse), key=lambda fit: float(log_likelihood(fit, select).sum()))
-    while len(members) > 1:
+    while members:
         members = loop.held(members, scene)
         left = [member for member in members if not member.accepted]
         if not left:
