@@ -63,16 +63,18 @@ def in_company(loop: Loop, turn: Turn, coarse: SurfelFit, fine: SurfelFit) -> Co
     grown = loop.fine(coarse, f"with_company_{loop.number}")
     scene = max((grown, coarse), key=lambda fit: float(log_likelihood(fit, select).sum()))
     while members:
-        members = loop.held(members, scene)
-        left = [member for member in members if not member.accepted]
-        if not left:
+        held = loop.held(members, scene)
+        members = [member for member, _ in held]
+        failing = [(member, without) for member, without in held if not member.accepted]
+        if not failing:
             without, with_them = (log_likelihood(fit, select) for fit in (fine, scene))
             better = weights([without, with_them], loop.block)[1] > 1 - loop.settings.open_share
             return Company(members, coarse, scene) if better else None
-        worst = min(left, key=_gain)
+        worst, fewer = min(failing, key=lambda each: _gain(each[0]))
         members = [member for member in members if member is not worst]
         assert worst.best is not None
-        scene, coarse = (loop.without(fit, worst.best.name) for fit in (scene, coarse))
+        coarse = fewer if coarse is scene else loop.without(coarse, worst.best.name)
+        scene = fewer
     return None
 
 

@@ -413,12 +413,15 @@ class Loop:
             the turn, accepted or not.
         """
         before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
-        weight = weights([before, after], self.block)[1]
-        found = Confirmed(*own, compare(before, after, self.block), weight)
-        yes = found.evidence > found.needed and weight > 1 - self.settings.open_share
+        found = self._confirmed(own, before, after)
+        yes = found.evidence > found.needed and found.weight > 1 - self.settings.open_share
         return replace(turn, confirmed=found, accepted=yes)
 
-    def held(self, turns: list[Turn], scene: SurfelFit) -> list[Turn]:
+    def _confirmed(self, own: tuple[float, float], before: Tensor, after: Tensor) -> Confirmed:
+        gain, weight = compare(before, after, self.block), weights([before, after], self.block)[1]
+        return Confirmed(*own, gain, weight)
+
+    def held(self, turns: list[Turn], scene: SurfelFit) -> list[tuple[Turn, SurfelFit]]:
         """Is each of several terms asked for beside all others?
 
         By its own evidence, or by the share that it explains of what the select spots leave unexplained
@@ -429,20 +432,21 @@ class Loop:
             scene: with all of them.
 
         Returns:
-            the turns, accepted or not.
+            the turns, accepted or not, each with the scene gone on without its term.
         """
         select, names = self.split.select, [turn.best.name for turn in turns if turn.best is not None]
         kept = f"company{self.number}_{'_'.join(names)}"
         whole, *fewer = self.absences(scene, names, kept)
         value, found = log_likelihood(whole, select), []
         for turn, name, fit in zip(turns, names, fewer, strict=True):
-            evidence, least = self._own(turn, scene, f"{kept}_own_{name}")
-            before = log_likelihood(fit, select)
-            gain, weight = compare(before, value, self.block), weights([before, value], self.block)[1]
-            explained = gain.nats / max(misfit_of(fit, select, len(select)), gain.nats, 1e-9)
-            yes = (evidence > least or explained > PREDICTED) and weight > 1 - self.settings.open_share
-            confirmed = Confirmed(evidence, least, gain, weight, explained)
-            found.append(replace(turn, confirmed=confirmed, accepted=yes))
+            own = self._own(turn, scene, f"{kept}_own_{name}")
+            alone = self._confirmed(own, log_likelihood(fit, select), value)
+            nats = alone.gain.nats
+            explained = nats / max(misfit_of(fit, select, len(select)), nats, 1e-9)
+            asked = alone.evidence > alone.needed or explained > PREDICTED
+            yes = asked and alone.weight > 1 - self.settings.open_share
+            confirmed = replace(alone, explained=explained)
+            found.append((replace(turn, confirmed=confirmed, accepted=yes), fit))
         return found
 
     def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:
