@@ -37,7 +37,7 @@ from nlos_lit.report.verdict import (
     verdict,
     weight_of,
 )
-from nlos_lit.report.words import AXES, describe
+from nlos_lit.report.words import AXES, capital, describe
 
 CAPTIONS = {
     "residual_time": "Residual along time, all spots together: how many standard deviations the counts lie"
@@ -305,7 +305,7 @@ def _remedies(diagnosis: Diagnosis) -> str:
     return (
         "<dl>"
         + "".join(
-            f"<dt>{_text(_capital(w.phrase))} <small>{_text(n)}</small></dt>"
+            f"<dt>{_text(capital(w.phrase))} <small>{_text(n)}</small></dt>"
             f"<dd>{_text(w.cause)} <b>{_text(w.remedy)}</b></dd>"
             for w, n in words
         )
@@ -488,10 +488,6 @@ def _image(name: str, png: bytes) -> Markup:
         f'<figure><img alt="{_text(base)}" src="data:image/png;base64,{data}">'
         f"<figcaption>{_text(base)}</figcaption></figure>"
     )
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _text(value: Any) -> str:

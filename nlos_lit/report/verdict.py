@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from nlos_lit.inference.result import Accepted, Diagnosis, Scores, Screened
 from nlos_lit.report.quantities import headline, number, percent, probability
-from nlos_lit.report.words import AXES, describe
+from nlos_lit.report.words import AXES, capital, describe
 
 AT_NOISE = 0.03  # excess over counting noise that is called "at the noise"
 BARELY = 0.05  # retained information below which the scene can imitate nearly all of an effect
@@ -255,8 +255,7 @@ def _explains(term: Accepted) -> str:
     """Of a term that other spots ask for."""
     phrase, share = describe(term.name).phrase, percent(term.explained)
     return (
-        f"{phrase[:1].upper()}{phrase[1:]} explains {share} of what spots that were not fitted leave"
-        " unexplained without it."
+        f"{capital(phrase)} explains {share} of what spots that were not fitted leave unexplained without it."
     )
 
 

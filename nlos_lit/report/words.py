@@ -60,6 +60,22 @@ class Description:
         return self.number(name).null
 
 
+def capital(text: str) -> str:
+    """A text as the beginning of a sentence.
+
+    Args:
+        text: of any length.
+
+    Returns:
+        the same, its first letter large.
+
+    Examples:
+        >>> capital("a ghost pulse")
+        'A ghost pulse'
+    """
+    return text[:1].upper() + text[1:]
+
+
 def describe(name: str) -> Description:
     """Words and numbers of an effect, a free term or a formula; one that has no words is called by its name.
 
