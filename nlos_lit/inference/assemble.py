@@ -17,7 +17,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
 from nlos_lit.inference.advise import expected_nats
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Trial, Turn
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Member, Trial
 from nlos_lit.inference.distil import Follower, laid_through
 from nlos_lit.inference.heldout import Comparison, by_block, score
 from nlos_lit.inference.pool import Candidate
@@ -78,12 +78,12 @@ def assemble(
     uncertainty = uncertain(final)
     terms = {e.name: e for e in final.extension.effects if isinstance(e, Free)}
     followed = {n: _followed(f, terms[n], uncertain(f.fit), scan) for n, f in followers.items()}
-    accepted = [_accepted(turn, found, uncertainty, split, scan, followed) for turn in found.accepted]
+    accepted = [_accepted(member, found, uncertainty, split, scan, followed) for member in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
-    first = found.turns[0].candidates
+    first = found.pools[0].candidates
     worst = max(unknown, key=lambda a: a.evidence, default=None)
-    left = [(c.effect.axis, c.evidence) for c in found.turns[-1].candidates if isinstance(c.effect, Free)]
+    left = [(c.effect.axis, c.evidence) for c in found.pools[-1].candidates if isinstance(c.effect, Free)]
     most = left[0] if worst is None else (worst.axis, worst.evidence)
     fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
     largest = first[0].evidence
@@ -92,14 +92,14 @@ def assemble(
         unknown=unknown,
         groups=[[a.name, *a.confusable_with] for a in named if a.confusable_with],
         unexplained=Unexplained(worst is not None, *most),
-        screened=[_screened(c, found.turns[0].needed) for c in first],
+        screened=[_screened(c, found.needed) for c in first],
         base=score(base, split.select),
         extended=score(final, split.select),
         untouched_test={"base": score(base, test), "extended": score(final, test)},
         witness=witness(capture, final),
         profiles=profiles(base, final, scan, fitted),
-        needed=found.turns[0].needed,
-        chance=math.exp(min(0.0, math.log(settings.level) + found.turns[0].needed - largest))
+        needed=found.needed,
+        chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
         if null is None
         else null.chance(largest),
         notes=[],
@@ -121,37 +121,36 @@ def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Sc
 
 
 def _accepted(
-    turn: Turn,
+    member: Member,
     found: Findings,
     uncertainty: Uncertainty,
     split: Split,
     scan: Scan,
     followed: Mapping[str, Followed],
 ) -> Accepted:
-    trial, confirmed = turn.best, turn.confirmed
-    assert trial is not None  # what makes a turn one of these
-    assert confirmed is not None
-    effect = next(e for e in found.final.extension.effects if e.name == trial.name)
+    confirmed, trial = member.confirmed, member.trial
+    assert confirmed is not None  # what makes a member accepted
+    effect = next(e for e in found.final.extension.effects if e.name == member.name)
     others = () if found.again is None else found.again.extension.effects
     again = next((e for e in others if e.name == effect.name), None)
     kept = {e.name for e in found.final.extension.effects}
-    weights = {name: w for name, w in turn.group.items() if name == trial.name or name not in kept}
+    weights = {name: w for name, w in member.group.items() if name == member.name or name not in kept}
     total = sum(weights.values())
     free = effect if isinstance(effect, Free) else None
     return Accepted(
         name=effect.name,
         parameters=uncertainty.parameters(effect, again),
         evidence=confirmed.evidence,
-        heldout_gain=_gain(found.final, found.losses[trial.name], split),
+        heldout_gain=_gain(found.final, trial.gain, split),
         weights={name: weight / total for name, weight in weights.items()},
         split_by="; ".join(sorted({EFFECTS.splitting(effect.name, other) for other in weights} - {""})),
-        advised=_advised(effect.name, list(weights), turn.trials),
+        advised=_advised(effect.name, list(weights), member.trials),
         axis=free.axis if free else "",
         shape=shape_of(free, scan) if free else None,
         formula=followed.get(effect.name),
         needed=confirmed.needed,
         explained=confirmed.explained,
-        tried={name: _tried(name, turn.trials, split) for name in weights},
+        tried={name: _tried(name, member.trials, split) for name in weights},
     )
 
 

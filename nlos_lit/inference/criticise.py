@@ -1,9 +1,7 @@
 """Show, name, extend, measure: the loop that finds out what a capture asks for (docs/criticism.md).
 
-A turn asks the pool beside a parsimonious scene, lets the fit go on with the leaders, and takes the simplest
-of those that may be the best by spots that were not fitted; none at all is the simplest. It is kept if it is
-still asked for once the scene is as fine as the counts ask for, and if that scene predicts better than one
-that grew without it.
+What the counts ask for together, beside a parsimonious scene, goes into the model together. Then each term
+must hold: the same scene goes on without it, and whoever is not missed by spots that were not fitted leaves.
 """
 
 from __future__ import annotations
@@ -11,7 +9,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -21,12 +19,13 @@ from torch import Tensor
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE_NAMES
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, ask, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -38,6 +37,7 @@ Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 PREDICTED = 0.25  # of what select spots leave unexplained without a term: who explains that much is believed
 WARM = 120  # batches, and as many again at falling rate
+OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 
 
 @dataclass(frozen=True)
@@ -50,39 +50,38 @@ class CriticismSettings:
             pool/level) nats of evidence.
         share: of the misfit that a fine scene leaves, nats; a term needs so much on top, as far as it acts
             where the scene's light falls. What is wrong for unknown reasons may look a little like anything.
-        rivals: effects with which the fit goes on in a turn, besides the best free term and the best with a
-            number for each spot.
-        open_share: weight above which the capture leaves something open: that nothing is to be named, in the
-            turn or beside a fine scene; or that an effect's rival is meant.
-        most_of: share of the best gain from which on a simpler term goes before that with the best …
+        most: terms that are tried together at most.
+        rivals: look-alikes that are tried in the place of each term that holds, at most.
+        open_share: weight above which the capture leaves something open: that a term is not missed; or that
+            its rival is meant.
+        most_of: share of the best gain from which on a simpler rival goes before that with the best …
         odds: … as it does if its weight is this much of the best's.
-        most: terms that are accepted at most.
         toys: simulated captures for the null distribution.
-        processes: that work on them; rebuilds that go on side by side.
+        processes: that work on them; fits that go on side by side.
     """
 
     spots: int = 1024
     level: float = 0.01
     share: float = 0.1
-    rivals: int = 6
+    most: int = 8
+    rivals: int = 2
     open_share: float = 0.05
     most_of: float = 0.9
     odds: float = 0.25
-    most: int = 5
     toys: int = 0
     processes: int = 2
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A fit gone on with one more term, or with none.
+    """The scene with one term in a place, or with none there.
 
     Args:
         candidate: the term; None for none.
         fit: the scene with it.
         likelihood: ``[S]`` of the select spots, nats.
-        gain: over going on with none.
-        weight: how far the capture leaves open that this is the best of its turn.
+        gain: over none.
+        weight: how far the capture leaves open that this is the best in that place.
     """
 
     candidate: Candidate | None
@@ -96,19 +95,16 @@ class Trial:
         return "none" if self.candidate is None else self.candidate.name
 
 
-Job = tuple[str, Candidate | None, Callable[[], SurfelFit]]  # what is said, term, what makes the fit
-
-
 @dataclass(frozen=True)
 class Confirmed:
-    """What is left of a term once the scene is fine.
+    """What a term is worth beside all others.
 
     Args:
-        evidence: nats, of the term beside all else.
+        evidence: its own, nats.
         needed: nats.
-        gain: of the select spots over the scene that grew without it.
+        gain: of the select spots over the same scene gone on without it.
         weight: how far the capture leaves open that it predicts better than that one.
-        explained: share of what the select spots leave unexplained without it; asked in company only.
+        explained: share of what the select spots leave unexplained without it.
     """
 
     evidence: float
@@ -119,31 +115,38 @@ class Confirmed:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """One turn of the loop.
+class Member:
+    """A term that was tried together with others.
 
     Args:
-        candidates: the pool, most evidence first.
-        needed: nats, of a term that a misfit may look like.
-        asked: names of those that have the evidence that they need.
-        trials: fits gone on with its leaders and with none, the largest gain first.
-        best: the simplest of those that gain most; None where nothing is asked for.
+        candidate: as the pool saw it.
+        rivals: that might be meant, as the pool saw them.
+        confirmed: what was found when it was last asked whether it holds.
+        accepted: it held.
+        trials: what was tried in its place once it held, the largest gain first: itself, rivals, none.
         group: it and what the capture cannot tell from it, by name, with weights. A free term is none for an
             effect.
-        confirmed: what a fine scene left of it; None where there was none.
-        accepted: it is in the model from here on.
-        refused: by name, those that were chosen before it and of which a fine scene left too little.
     """
 
-    candidates: list[Candidate]
-    needed: float
-    asked: frozenset[str] = frozenset()
-    trials: list[Trial] = field(default_factory=list)
-    best: Trial | None = None
-    group: dict[str, float] = field(default_factory=dict)
+    candidate: Candidate
+    rivals: Sequence[Candidate] = ()
     confirmed: Confirmed | None = None
     accepted: bool = False
-    refused: dict[str, Confirmed] = field(default_factory=dict)
+    trials: list[Trial] = field(default_factory=list)
+    group: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.candidate.name
+
+    @property
+    def free(self) -> bool:
+        return self.name in FREE_NAMES
+
+    @property
+    def trial(self) -> Trial:
+        """With its term, once it held."""
+        return next(t for t in self.trials if t.name == self.name)
 
 
 @dataclass
@@ -152,39 +155,25 @@ class Findings:
 
     Args:
         base: the fine fit without effects.
-        final: the fine fit with all terms that were kept.
-        turns: of the loop.
-        losses: what each kept term's absence costs on the select spots, beside the final scene.
-        again: the fit with these terms before the scene was refined; None where there is none.
+        final: the fit with all terms that hold.
+        pools: what was asked for, beside the base and whenever terms had come to it.
+        members: terms that were tried, in the order in which they came.
+        needed: nats of own evidence that a term needs beside the base, if it acts where the scene's light
+            falls.
+        again: the parsimonious fit with the terms that hold; None where there is none.
     """
 
     base: SurfelFit
     final: SurfelFit
-    turns: list[Turn]
-    losses: dict[str, Comparison] = field(default_factory=dict)
+    needed: float
+    pools: list[Pool] = field(default_factory=list)
+    members: list[Member] = field(default_factory=list)
     again: SurfelFit | None = None
 
     @property
-    def accepted(self) -> list[Turn]:
-        """Turns whose term was kept."""
-        kept = {e.name for e in self.final.extension.effects}
-        return [t for t in self.turns if t.accepted and t.best is not None and t.best.name in kept]
-
-
-def needed(candidates: list[Candidate], s: CriticismSettings, misfit: float, lit: float = 1.0) -> float:
-    """Nats that a term of this pool needs.
-
-    Args:
-        candidates: the pool.
-        s: settings.
-        misfit: nats, see :func:`misfit_of`.
-        lit: how far a misfit of the scene may look like the term, see
-            :class:`~nlos_lit.inference.pool.Candidate`.
-
-    Returns:
-        ln(terms/level) and, as far as it may be the scene's, the settings' share of the misfit.
-    """
-    return math.log(len(candidates) / s.level) + s.share * lit * misfit
+    def accepted(self) -> list[Member]:
+        """Terms that hold."""
+        return [m for m in self.members if m.accepted]
 
 
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
@@ -279,7 +268,7 @@ def go_on(fit: SurfelFit) -> SurfelFit:
 
 
 class Loop:
-    """All turns of one capture.
+    """All that is tried on one capture.
 
     Args:
         rebuild: a parsimonious fit from new seeds with given effects, begun at their present values, and
@@ -306,197 +295,66 @@ class Loop:
         self.split, self.scan, self.settings = split, scan, settings
         self.seed, self.steps, self.number = seed, steps, 0
         self.block = split.block[split.select]
+        self.least = math.log((len(EFFECTS) + len(FREE)) / settings.level)
 
-    def turn(self, fit: SurfelFit, fine: SurfelFit | None) -> Turn:
-        """Ask the pool, go on with its leaders, choose.
+    def ask(self, fit: SurfelFit, room: int, of_spots: bool = False) -> Pool:
+        """What the counts ask for beside a fit.
 
         Args:
-            fit: with the terms accepted so far.
-            fine: the fine scene with these terms, a share of whose misfit leaders must exceed; None asks for
-                no share.
+            fit: that is criticised.
+            room: for so many terms that are taken together.
+            of_spots: only terms with a number for each spot are asked.
 
         Returns:
-            the turn, not confirmed yet; its ``best`` is None where nothing is asked for.
+            the pool.
         """
-        s, self.number = self.settings, self.number + 1
-        self.steps.plan(screen=1, fit=s.rivals + 5)
-        asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed)
-        candidates = self.steps(
-            "screen", f"asking the pool, turn {self.number}", f"turn{self.number}_pool", asking
+        self.number += 1
+        s, only = self.settings, OF_SPOTS if of_spots else None
+        asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed, self.least, room, only)
+        text = "asking single spots" if of_spots else "asking the pool"
+        return self.steps("screen", f"{text}, {self.number}", f"pool{self.number}", asking)
+
+    def joined(self, fit: SurfelFit, new: list[Candidate]) -> SurfelFit:
+        """A parsimonious scene with more terms.
+
+        The present one goes on with them, and is built anew, where that predicts better: surfels that
+        imitated the terms do not come back.
+
+        Args:
+            fit: parsimonious.
+            new: terms that come to it.
+
+        Returns:
+            another fit.
+        """
+        names = "_".join(c.name for c in new)
+        self.steps.plan(fit=3)
+        warm = self.gone_on(fit, new)
+        other = self.steps(
+            "fit",
+            f"rebuilding the scene with {', '.join(e.name for e in warm.extension.effects)}",
+            f"new{self.number}_{names}",
+            partial(_rebuilt, self.rebuild, warm.extension, self.seed),
         )
-        # Before it is in the model, a term is part of the misfit of other spots itself.
-        misfit = 0.0 if fine is None else self._misfit(fine, self.split.fit)
-        bars = {c.name: needed(candidates, s, misfit, c.lit) for c in candidates}
-        asked = frozenset(c.name for c in candidates if c.evidence > bars[c.name])
-        turn = Turn(candidates, needed(candidates, s, misfit), asked)
-        rivals = leaders([c for c in candidates if c.loud > bars[c.name]], s.rivals)
-        if not rivals:
-            return turn
-        jobs: list[Job] = [("going on without another term", None, partial(self._warm, fit, []))]
-        jobs += [(f"going on with {c.name}", c, partial(self._warm, fit, [c])) for c in rivals]
-        trials = weighed(self._trials(jobs), self.block)
-        return self.among(replace(turn, trials=trials), trials)
+        return warm if other is None else self.better(other, warm)
 
-    def next_best(self, turn: Turn) -> Turn | None:
-        """The turn with what is chosen in place of a term of which a fine scene left too little.
+    def better(self, *fits: SurfelFit) -> SurfelFit:
+        """The one that predicts the select spots best."""
+        return max(fits, key=lambda fit: float(log_likelihood(fit, self.split.select).sum()))
 
-        It is one of those that the pool itself asks for.
+    def gone_on(self, fit: SurfelFit, new: list[Candidate]) -> SurfelFit:
+        """The same scene, gone on with more terms.
 
         Args:
-            turn: with a best term that was not accepted.
+            fit: that is copied.
+            new: the terms.
 
         Returns:
-            the turn, not confirmed yet; None where nothing else is asked for.
+            another fit.
         """
-        assert turn.best is not None
-        assert turn.confirmed is not None
-        refused = {**turn.refused, turn.best.name: turn.confirmed}
-        left = [
-            t for t in turn.trials if t.candidate is None or (t.name in turn.asked and t.name not in refused)
-        ]
-        if len(left) == 1:
-            return None
-        bare = replace(turn, best=None, group={}, confirmed=None)
-        other = self.among(bare, weighed(left, self.block))
-        if other.best is None:
-            return None
-        self.steps.plan(screen=1, fit=2)
-        return replace(other, refused=refused)
-
-    def among(self, turn: Turn, trials: list[Trial]) -> Turn:
-        """The turn with what is chosen among some of its trials.
-
-        Args:
-            turn: without a best term.
-            trials: with weights, the largest gain first; that with none is one of them.
-
-        Returns:
-            the turn; its ``best`` is None where nothing is chosen.
-        """
-        best = chosen(trials, self.settings)
-        if best is None:
-            return turn
-        return replace(turn, best=best, group=group_of(best, trials, self.block, self.settings.open_share))
-
-    def own(self, turn: Turn, fine: SurfelFit) -> tuple[float, float]:
-        """How much the turn's best term is asked for beside a fine scene.
-
-        Args:
-            turn: with a best term.
-            fine: the fine scene with it.
-
-        Returns:
-            its own evidence and what it needs, nats.
-        """
-        assert turn.best is not None
-        tried = "" if turn.confirmed is None else "_again"
-        return self._own(turn, fine, f"turn{self.number}_own_{turn.best.name}{tried}")
-
-    def _own(self, turn: Turn, fine: SurfelFit, kept: str) -> tuple[float, float]:
-        assert turn.best is not None
-        s, name = self.settings, turn.best.name
-        own = partial(own_evidence, fine, self.split, s.spots, self.seed, name)
-        nats, lit = self.steps("screen", f"asking for {name} again", kept, own)
-        misfit = self._misfit(fine, self.split.fit, self.split.select)
-        return nats, needed(turn.candidates, s, misfit, lit)
-
-    def confirm(self, turn: Turn, own: tuple[float, float], fine: SurfelFit, without: SurfelFit) -> Turn:
-        """Is the turn's best term still asked for beside a fine scene?
-
-        Args:
-            turn: with a best term.
-            own: its evidence there, and what it needs.
-            fine: the fine scene with it.
-            without: the fine scene without it.
-
-        Returns:
-            the turn, accepted or not.
-        """
-        before, after = (log_likelihood(f, self.split.select) for f in (without, fine))
-        found = self._confirmed(own, before, after)
-        yes = found.evidence > found.needed and found.weight > 1 - self.settings.open_share
-        return replace(turn, confirmed=found, accepted=yes)
-
-    def _confirmed(self, own: tuple[float, float], before: Tensor, after: Tensor) -> Confirmed:
-        gain, weight = compare(before, after, self.block), weights([before, after], self.block)[1]
-        return Confirmed(*own, gain, weight)
-
-    def held(self, turns: list[Turn], scene: SurfelFit) -> list[tuple[Turn, SurfelFit]]:
-        """Is each of several terms asked for beside all others?
-
-        By its own evidence, or by the share that it explains of what the select spots leave unexplained
-        without it; and they must be predicted better with it.
-
-        Args:
-            turns: with a best term each.
-            scene: with all of them.
-
-        Returns:
-            the turns, accepted or not, each with the scene gone on without its term.
-        """
-        select, names = self.split.select, [turn.best.name for turn in turns if turn.best is not None]
-        kept = f"company{self.number}_{'_'.join(names)}"
-        whole, *fewer = self.absences(scene, names, kept)
-        value, found = log_likelihood(whole, select), []
-        for turn, name, fit in zip(turns, names, fewer, strict=True):
-            own = self._own(turn, scene, f"{kept}_own_{name}")
-            alone = self._confirmed(own, log_likelihood(fit, select), value)
-            nats = alone.gain.nats
-            explained = nats / max(misfit_of(fit, select, len(select)), nats, 1e-9)
-            asked = alone.evidence > alone.needed or explained > PREDICTED
-            yes = asked and alone.weight > 1 - self.settings.open_share
-            confirmed = replace(alone, explained=explained)
-            found.append((replace(turn, confirmed=confirmed, accepted=yes), fit))
-        return found
-
-    def asked_again(self, turn: Turn, fine: SurfelFit) -> tuple[Turn, SurfelFit, SurfelFit]:
-        """Is the turn's best term still asked for beside a fine scene, in one of two ways?
-
-        Args:
-            turn: with a best term.
-            fine: the fine scene without it.
-
-        Returns:
-            the turn, accepted or not; the parsimonious and the fine scene with the term.
-        """
-        assert turn.best is not None
-        again = self.again(turn.best)
-        refined = self.fine(again, f"with_{turn.best.name}_{self.number}")
-        own = self.own(turn, refined)
-        if own[0] <= own[1]:
-            return self.confirm(turn, own, refined, fine), again, refined
-        turn = self.confirm(turn, own, refined, self.fair(turn, again, fine))
-        if not turn.accepted:
-            refined, without = self.beside(turn, refined, fine)
-            turn = self.confirm(turn, self.own(turn, refined), refined, without)
-        return turn, again, refined
-
-    def beside(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> tuple[SurfelFit, SurfelFit]:
-        """The fine scene without a turn's best term goes on with it, and without: whatever seeds do to a
-        scene they do to both. A scene that has taken up the term gains nothing so: this is asked second.
-
-        Args:
-            turn: with a best term.
-            with_it: a fine scene with it.
-            fine: the fine scene without it.
-
-        Returns:
-            with it and without.
-        """
-        assert turn.best is not None
-        name = turn.best.name
-        effect = next(e for e in with_it.extension.effects if e.name == name)
-        found = [
-            self.steps("fit", f"going on beside the fine scene, {text}", f"turn{self.number}_{text}", make)
-            for text, make in (
-                (
-                    f"with {name}",
-                    lambda: go_on(fine.copy(copy_effects(fine.extension, [effect]), self.seed)),
-                ),
-                (f"without {name}", lambda: self._warm(fine, [])),
-            )
-        ]
-        return found[0], found[1]
+        names = ", ".join(c.name for c in new)
+        name = f"on{self.number}_{'_'.join(c.name for c in new)}"
+        return self.steps("fit", f"going on with {names}", name, partial(self._warm, fit, new))
 
     def fine(self, fit: SurfelFit, name: str) -> SurfelFit:
         """The scene as fine as the counts ask for, with the fit's terms.
@@ -511,106 +369,233 @@ class Loop:
         text = f"refining the scene {name.replace('_', ' ')}"
         return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
 
-    def again(self, trial: Trial) -> SurfelFit:
-        """The parsimonious scene built anew with a trial's terms, where that predicts better: surfels that
-        imitated a term do not come back.
-        """
-        name = trial.name
-        make = partial(_rebuilt, self.rebuild, trial.fit.extension, self.seed)
-        other = self.steps("fit", f"rebuilding the scene with {name}", f"turn{self.number}_new_{name}", make)
-        if other is None:
-            return trial.fit
-        value = log_likelihood(other, self.split.select)
-        return other if float(value.sum()) > float(trial.likelihood.sum()) else trial.fit
+    def hold(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
+        """Which of some terms hold, beside each other.
 
-    def fair(self, turn: Turn, with_it: SurfelFit, fine: SurfelFit) -> SurfelFit:
-        """The fine scene without a turn's best term, with the chance that the term had: other seeds alone may
-        find a better one.
+        The least of those that do not hold leaves, a free term before an effect, and all that stay are asked
+        again: of two that stand for each other neither is missed.
 
         Args:
-            turn: with a best term.
-            with_it: the scene that was chosen for it.
-            fine: the fine scene without it.
+            members: whose terms the scene has.
+            scene: with all of them.
 
         Returns:
-            the better of two where the term's was built anew, else ``fine``.
+            The same members, accepted or not, with none and itself as trials where they are, and the scene
+            without those that left.
         """
-        assert turn.best is not None
-        if with_it is turn.best.fit:
-            return fine
-        none = next(t for t in turn.trials if t.candidate is None)
-        scene = self.again(none)
-        if scene is none.fit:
-            return fine
-        other = self.fine(scene, f"without_{turn.best.name}_{self.number}")
-        before, after = (log_likelihood(f, self.split.select).sum() for f in (fine, other))
-        return other if after > before else fine
+        staying, left = list(members), dict[str, Member]()
+        while staying:
+            asked = self._asked(staying, scene)
+            staying = [member for member, _ in asked]
+            failing = [pair for pair in asked if not pair[0].accepted]
+            if not failing:
+                break
+            worst, scene = min(failing, key=lambda pair: (not pair[0].free, _gain(pair[0])))
+            staying.remove(worst)
+            left[worst.name] = worst
+        now = {m.name: m for m in staying} | left
+        return [now[m.name] for m in members], scene
 
-    def _misfit(self, fit: SurfelFit, *parts: np.ndarray) -> float:
-        """In the mean of some parts of the spots, for as many as the pool is asked on.
+    def _asked(self, members: list[Member], scene: SurfelFit) -> list[tuple[Member, SurfelFit]]:
+        """Each of some terms, asked beside the others, and the scene gone on without it."""
+        s, select, names = self.settings, self.split.select, [m.name for m in members]
+        kept = f"hold{self.number}_{'_'.join(names)}"
+        self.steps.plan(fit=1 + len(names), screen=1)
+        jobs = [("going on with all", kept, partial(self._warm, scene, []))]
+        jobs += [
+            (f"going on without {n}", f"{kept}_but_{n}", partial(self.without, scene, [n])) for n in names
+        ]
+        whole, *fewer = self.steps.several("fit", jobs, s.processes)
+        asking = partial(own_evidence, scene, self.split, s.spots, self.seed, names)
+        own = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
+        misfit, value, found = self._misfit(scene), log_likelihood(whole, select), []
+        for member, fit in zip(members, fewer, strict=True):
+            before, (evidence, lit) = log_likelihood(fit, select), own[member.name]
+            gain, weight = compare(before, value, self.block), weights([before, value], self.block)[1]
+            explained = gain.nats / max(misfit_of(fit, select, len(select)), gain.nats, 1e-9)
+            needed = self.least + s.share * lit * misfit
+            asked_for = evidence > needed or (
+                len(members) > 1 and not _of_spots(member) and explained > PREDICTED
+            )
+            confirmed = Confirmed(evidence, needed, gain, weight, explained)
+            none = Trial(None, fit, before, compare(before, before, self.block))
+            trials = [Trial(member.candidate, whole, value, gain), none]
+            yes = asked_for and weight > 1 - s.open_share
+            found.append((replace(member, confirmed=confirmed, accepted=yes, trials=trials), fit))
+        return found
+
+    def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
+        """Terms with a number for each spot, which are asked last: with them nothing is predicted for others.
+
+        What has come with such a term may not hold beside it.
+
+        Args:
+            members: that were tried.
+            scene: with those that hold.
+
+        Returns:
+            The members, such terms among them, and the scene with those that hold.
+        """
+        while True:
+            tried = {m.name for m in members}
+            pool = self.ask(scene, 0, of_spots=True)
+            new = [c for c in pool.candidates if c.evidence > self.least and c.name not in tried]
+            if not new:
+                return members, scene
+            staying = [m for m in members if m.accepted] + [Member(new[0])]
+            staying, with_it = self.hold(staying, self.gone_on(scene, new[:1]))
+            if not staying[-1].accepted:
+                return [*members, staying[-1]], scene
+            now = {m.name: m for m in staying}
+            members, scene = [now.get(m.name, m) for m in members] + staying[-1:], with_it
+
+    def predicts(self, scene: SurfelFit, other: SurfelFit) -> bool:
+        """Whether a scene predicts the select spots better than another, whatever blocks had been drawn."""
+        values = [log_likelihood(fit, self.split.select) for fit in (other, scene)]
+        return weights(values, self.block)[1] > 1 - self.settings.open_share
+
+    def named(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
+        """The terms that hold, each held against its rivals.
+
+        Args:
+            members: that were tried.
+            scene: with those that hold.
+
+        Returns:
+            The members, and the scene with what each is now.
+        """
+        settled = [self.settled(m) if m.accepted else m for m in members]
+        other = [(old.name, new) for old, new in zip(members, settled, strict=True) if old.name != new.name]
+        if other:
+            bare = self.without(scene, [name for name, _ in other])
+            scene = self.gone_on(bare, [new.candidate for _, new in other])
+        return settled, scene
+
+    def only(self, fit: SurfelFit, names: set[str]) -> SurfelFit:
+        """The same scene, gone on without all other terms, where it has any."""
+        others = [e.name for e in fit.extension.effects if e.name not in names]
+        if not others:
+            return fit
+        text = f"going on without {', '.join(others)}"
+        return self.steps("fit", text, "only_what_holds", partial(self.without, fit, others))
+
+    def needed(self, fit: SurfelFit) -> float:
+        """Nats of own evidence that a term needs beside a fine scene, if it acts where its light falls."""
+        return self.least + self.settings.share * self._misfit(fit)
+
+    def settled(self, member: Member) -> Member:
+        """A member with what its rivals are worth in its place.
+
+        Args:
+            member: that holds.
+
+        Returns:
+            The member, with the simplest of those that gain most as its term.
+        """
+        s = self.settings
+        itself, none = member.trials
+        rivals = list(member.rivals[: s.rivals])
+        jobs = [
+            (
+                f"going on with {c.name} for {member.name}",
+                f"rival{self.number}_{member.name}_{c.name}",
+                partial(self._warm, none.fit, [c]),
+            )
+            for c in rivals
+        ]
+        self.steps.plan(fit=len(jobs))
+        trials = [itself, none]
+        for c, fit in zip(rivals, self.steps.several("fit", jobs, s.processes), strict=True):
+            value = log_likelihood(fit, self.split.select)
+            trials.append(Trial(c, fit, value, compare(none.likelihood, value, self.block)))
+        trials = weighed(trials, self.block)
+        best = chosen(trials, s) or itself
+        assert best.candidate is not None
+        group = group_of(best, trials, self.block, s.open_share)
+        return replace(member, candidate=best.candidate, trials=trials, group=group)
+
+    def _misfit(self, fit: SurfelFit) -> float:
+        """In the mean of fitted and select spots, for as many as the pool is asked on.
 
         What surfels take up of the noise of fitted spots they add to that of the others: the mean of both
         holds neither.
         """
         number = min(len(self.split.fit), self.settings.spots)
+        parts = (self.split.fit, self.split.select)
         return max(0.0, sum(misfit_of(fit, spots, number) for spots in parts) / len(parts))
 
     def _warm(self, fit: SurfelFit, extra: list[Candidate]) -> SurfelFit:
         """The same scene, gone on with more terms."""
         return go_on(fit.copy(begun_with(fit, extra), self.seed))
 
-    def without(self, fit: SurfelFit, name: str) -> SurfelFit:
-        """The same scene, gone on without a term.
+    def without(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
+        """The same scene, gone on without some terms.
 
         Args:
             fit: that is copied.
-            name: of the term.
+            names: of the terms.
 
         Returns:
             another fit.
         """
-        fewer = [e for e in copy_effects(fit.extension, []).effects if e.name != name]
+        fewer = [e for e in copy_effects(fit.extension, []).effects if e.name not in names]
         return go_on(fit.copy(Extension(fewer), self.seed))
 
-    def _trials(self, jobs: list[Job]) -> list[Trial]:
-        named = [(text, f"turn{self.number}_{text.replace(' ', '_')}", make) for text, _, make in jobs]
-        fits = self.steps.several("fit", named, self.settings.processes)
-        values = [log_likelihood(f, self.split.select) for f in fits]
-        return [
-            Trial(c, f, v, compare(values[0], v, self.block))
-            for (_, c, _), f, v in zip(jobs, fits, values, strict=True)
-        ]
 
-    def losses(self, fit: SurfelFit) -> dict[str, Comparison]:
-        """What each term's absence costs on the select spots, where the same scene goes on without it.
+# Fine fit without effects, present one, terms so far.
+Told = Callable[[SurfelFit, SurfelFit, list[Member]], None]
 
-        Args:
-            fit: the final one.
 
-        Returns:
-            by name.
-        """
-        names = [e.name for e in fit.extension.effects]
-        if not names:
-            return {}
-        whole, *fewer = [log_likelihood(f, self.split.select) for f in self.absences(fit, names, "all")]
-        return {n: compare(v, whole, self.block) for n, v in zip(names, fewer, strict=True)}
+def criticise(
+    base: SurfelFit,
+    rebuild: Rebuild,
+    grow: Grow,
+    split: Split,
+    scan: Scan,
+    s: CriticismSettings,
+    seed: int,
+    steps: Steps | None = None,
+    told: Told = lambda base, present, members: None,
+) -> Findings:
+    """Find out what the capture asks for.
 
-    def absences(self, fit: SurfelFit, names: list[str], kept: str) -> list[SurfelFit]:
-        """The same scene gone on with all terms, and without each of some.
+    Args:
+        base: fitted to ``split.fit`` without effects, coarse.
+        rebuild, grow: see :class:`Loop`.
+        split: of the spots.
+        scan: of the capture.
+        s: settings.
+        seed: of everything random.
+        steps: says and keeps what is done.
+        told: called before anything is asked, when terms came, and when it is known which hold.
 
-        Args:
-            fit: with the terms.
-            names: of those that are left out, one at a time.
-            kept: name of the steps.
-
-        Returns:
-            one more than names.
-        """
-        jobs = [("going on with all", kept, partial(self._warm, fit, []))]
-        jobs += [(f"going on without {n}", f"{kept}_but_{n}", partial(self.without, fit, n)) for n in names]
-        self.steps.plan(fit=len(jobs))
-        return self.steps.several("fit", jobs, self.settings.processes)
+    Returns:
+        base, terms and final fit.
+    """
+    loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
+    first = loop.fine(base, "without_effects")
+    found, coarse = Findings(first, first, loop.needed(first)), base
+    told(first, first, [])
+    while True:
+        pool = loop.ask(coarse, s.most - len(found.members))
+        found.pools.append(pool)
+        if not pool.together:
+            break
+        coarse = loop.joined(coarse, [t.candidate for t in pool.together])
+        found.members += [Member(t.candidate, t.rivals) for t in pool.together]
+        told(first, coarse, found.members)
+    scene = first
+    if found.members:
+        scene = loop.better(loop.fine(coarse, "with_all"), coarse)
+        found.members, scene = loop.hold(found.members, scene)
+    found.members, scene = loop.single_spots(found.members, scene)
+    if found.accepted and loop.predicts(scene, first):
+        found.members, found.final = loop.named(found.members, scene)
+        found.again = loop.only(coarse, {m.name for m in found.accepted})
+    else:
+        found.members = [replace(m, accepted=False) for m in found.members]
+    told(first, found.final, found.members)
+    return found
 
 
 def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
@@ -626,39 +611,6 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     shares = weights([t.likelihood for t in trials], block)
     found = [replace(t, weight=w) for t, w in zip(trials, shares, strict=True)]
     return sorted(found, key=lambda t: -t.gain.nats)
-
-
-def is_law(candidate: Candidate | None) -> bool:
-    """A term that is an effect, and not one with a number for each spot."""
-    return candidate is not None and candidate.name not in FREE_NAMES and not candidate.effect.per_spot
-
-
-def per_spot(turn: Turn) -> bool:
-    """The turn's best term has a number for each spot."""
-    return turn.best is not None and turn.best.candidate is not None and turn.best.candidate.effect.per_spot
-
-
-def leaders(candidates: list[Candidate], number: int) -> list[Candidate]:
-    """Which terms are tried.
-
-    Half of the effects have the most evidence; the others would have, were their scatter their own: one
-    linear step towards a strong effect leaves an error that scatters like a misfit.
-
-    Args:
-        candidates: that have what they need, if all of the scatter is theirs; most evidence first.
-        number: of effects that are the same law at all spots; the best free term and the best with a number
-            for each spot come on top.
-
-    Returns:
-        those, most evidence first.
-    """
-    laws = [c for c in candidates if is_law(c)]
-    tried = laws[: number // 2]
-    rest = [c for c in laws if c not in tried]
-    tried += sorted(rest, key=lambda c: -c.loud)[: number - len(tried)]
-    tried += [c for c in candidates if c.name in FREE_NAMES and not c.effect.per_spot][:1]
-    tried += [c for c in candidates if c.effect.per_spot][:1]
-    return sorted(tried, key=lambda c: -c.evidence)
 
 
 def chosen(trials: list[Trial], s: CriticismSettings) -> Trial | None:
@@ -704,3 +656,12 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) 
     shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
     left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
     return {name: weight / sum(left.values()) for name, weight in left.items()}
+
+
+def _of_spots(member: Member) -> bool:
+    return member.candidate.effect.per_spot
+
+
+def _gain(member: Member) -> float:
+    assert member.confirmed is not None
+    return member.confirmed.gain.nats

@@ -16,18 +16,17 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Loop, Turn
+from nlos_lit.inference.criticise import CriticismSettings, Findings, Loop, Member, criticise
 from nlos_lit.inference.distil import distil
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import Split, split_spots
 from nlos_lit.inference.toys import run_toys
-from nlos_lit.inference.turns import criticise
 from nlos_lit.runtime.steps import Report, Steps
 from nlos_lit.surfels.fit import SurfelFit
 
-Progress = Callable[[tuple[Tensor, VolumeGrid], SurfelFit, SurfelFit, list[Turn]], None]
+Progress = Callable[[tuple[Tensor, VolumeGrid], SurfelFit, SurfelFit, list[Member]], None]
 
 
 def split_of(capture: Capture) -> Split:
@@ -76,8 +75,8 @@ def diagnose(
             arguments goes on; needed with ``options.toys``.
         settings: all that results depend on, see :class:`~nlos_lit.runtime.steps.Steps`.
         report: called as steps begin, see :class:`~nlos_lit.runtime.steps.Steps`.
-        told: called before the first turn and after each with the image and its grid, the fine fit without
-            effects, the present one, and the turns so far.
+        told: called before anything is asked, whenever terms come, and at the end, with the image and its
+            grid, the fine fit without effects, the present one, and the terms so far.
 
     Returns:
         the diagnosis, and the fits behind it.
@@ -90,7 +89,7 @@ def diagnose(
     split, scan = split_of(capture), Scan.of(capture)
     steps = Steps(report, None if folder is None else folder / "steps", settings, kinds(scan))
     steps.share({"capture": capture, "settings": pipeline.surfels})
-    steps.plan(image=image is None, fit=2 + options.rivals, screen=1)
+    steps.plan(image=image is None, fit=2, screen=1)
     if image is None:
         image = steps("image", "imaging", "image", lambda: pipeline.image(capture))
     base = steps(

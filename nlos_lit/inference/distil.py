@@ -57,12 +57,10 @@ def distil(loop: Loop, found: Findings) -> dict[str, Follower]:
         by the free term's name; nothing for one that acts along no single axis, or gains nothing any more.
     """
     followers = {}
-    for turn in found.accepted:
-        assert turn.best is not None
-        name = turn.best.name
-        follower = _of_term(loop, found.final, name, found.losses[name].nats)
+    for member in found.accepted:
+        follower = _of_term(loop, found.final, member.name, member.trial.gain.nats)
         if follower is not None:
-            followers[name] = follower
+            followers[member.name] = follower
     return followers
 
 
@@ -83,7 +81,7 @@ def _of_term(loop: Loop, final: SurfelFit, name: str, gain: float) -> Follower |
         fit.match_energy()  # a constant is none of a formula's, and may have been of the term's
         return go_on(fit)
 
-    jobs = [(f"going on without {name}", f"all_but_{name}", partial(loop.without, final, name))]
+    jobs = [(f"going on without {name}", f"all_but_{name}", partial(loop.without, final, [name]))]
     for formula in tried:
         text, kept = f"going on with {formula.name}", f"{formula.name}_for_{name}"
         jobs.append((text, kept, partial(with_it, formula)))

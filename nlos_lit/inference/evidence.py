@@ -34,6 +34,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -67,6 +68,16 @@ def log_factor(values: Tensor, squares: Tensor, variances: Tensor) -> Tensor:
     return 0.5 * (variances[:, None] * squares[..., None, :] / grown - grown.log()).sum(-1)
 
 
+class Rows(NamedTuple):
+    """One weighted least-squares problem: what a :class:`~nlos_lit.inference.problem.Problem` holds of it."""
+
+    nuisance: Tensor  # [N, P] X
+    prior: Tensor  # [P] precision of each of its coefficients
+    uneven: Tensor  # [N, Q] U
+    residual: Tensor  # [N]
+    lit: Tensor  # [n ≤ N] share of the scene's light in each row of bins
+
+
 class Projector:
     """Takes from any columns what the base can explain by itself.
 
@@ -79,12 +90,14 @@ class Projector:
         residual: after both steps, at that width.
     """
 
-    def __init__(self, problem: Problem, ridge: float = 1e-6) -> None:
+    def __init__(self, problem: Problem | Rows, ridge: float = 1e-6) -> None:
         x = problem.nuisance
         gram = half_products(x).double()
         if not bool(torch.isfinite(gram).all()):
             raise ValueError("the model's sensitivities are not finite: this fit cannot be criticised")
-        diagonal = gram.diagonal().clone().clamp_min(float(gram.diagonal().mean()) * 1e-6)
+        diagonal = gram.diagonal().clone()
+        if len(gram):
+            diagonal = diagonal.clamp_min(float(diagonal.mean()) * 1e-6)
         failed = 1
         while failed:  # single-precision products of nearly dependent columns may need more
             self.factor, failed = torch.linalg.cholesky_ex(
@@ -103,6 +116,20 @@ class Projector:
         self.levels = levels - levels[self.width]
         self.residuals: dict[int, Tensor] = {}
         self.residual = self.residual_at(self.width)
+
+    def beside(self, columns: Tensor, precision: Tensor, residual: Tensor | None = None) -> Projector:
+        """Takes off some terms, too; its columns are :meth:`free` of this one.
+
+        Args:
+            columns: ``[N + H, k]`` of the terms, :meth:`free`; there may be none.
+            precision: ``[k]`` of their coefficients' prior.
+            residual: ``[N + H]`` in place of this one's.
+
+        Returns:
+            another projector.
+        """
+        left = self.left[:, 0] if residual is None else residual
+        return Projector(Rows(columns, precision, self.uneven, left, self.lit))
 
     def free(self, columns: Tensor) -> Tensor:
         """``[N + H, k]``: ``columns`` ``[N, k]`` without their projection on the nuisance."""

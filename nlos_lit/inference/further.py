@@ -214,8 +214,8 @@ class _Asking:
     def _asked(self, names: list[str]) -> list[Candidate]:
         """What is open, as the pool sees it here."""
         lit = lit_by(self.base, self.scan)
-        asking = partial(ask, self.base, self.split, lit, self.options.spots, self.seed, names)
-        return self.steps("screen", "asking for what is open", "pool", asking)
+        asking = partial(ask, self.base, self.split, lit, self.options.spots, self.seed, only=names)
+        return self.steps("screen", "asking for what is open", "pool", asking).candidates
 
     def _gone_on(self, name: str, extension: Extension) -> SurfelFit:
         fit = self.base.copy(extension, self.seed)

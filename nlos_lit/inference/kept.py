@@ -13,7 +13,7 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import FORMULAS
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.pool import Candidate
+from nlos_lit.inference.pool import Candidate, Pool, Taken
 from nlos_lit.runtime.plain_file import Kind, record
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 
@@ -25,7 +25,7 @@ def kinds(scan: Scan) -> list[Kind]:
         return _effect(scan, **parts)
 
     return [
-        *(record(of) for of in (Candidate, VolumeGrid, SurfelSettings)),
+        *(record(of) for of in (Candidate, Taken, Pool, VolumeGrid, SurfelSettings)),
         Kind(SurfelFit, SurfelFit.parts, SurfelFit.of_parts),
         Kind(Extension, lambda e: {"effects": list(e.effects)}, lambda parts: Extension(**parts)),
         Kind(Effect, _parts, effect),

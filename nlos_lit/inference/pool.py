@@ -14,7 +14,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
-from nlos_lit.effects.free_terms import FREE
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.evidence import (
     SEGMENTS,
     Evidence,
@@ -29,6 +29,7 @@ from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.fit import SurfelFit
 
+MOST = 0.9  # of the largest evidence: terms with so much may be taken if they are simpler
 KEPT = 16  # shapes of one effect that are tested in full; the others are worth nothing beside them
 TOGETHER = 128  # columns from which on no more effects are projected along
 WORK = 5e10  # multiplications of the nuisance columns with each other, some 1 s of one core
@@ -52,6 +53,7 @@ class Candidate:
         lit: how far a misfit of the scene may look like it: the share of its information that lies where the
             scene's light falls; 0 of what single spots have over their neighbours, since a scene is seen
             alike from neighbouring points.
+        scale: τ, of the coefficients' deviations.
     """
 
     effect: Effect
@@ -63,10 +65,38 @@ class Candidate:
     error: Tensor = field(repr=False)
     loud: float
     lit: float = 1.0
+    scale: float = 0.0
 
     @property
     def name(self) -> str:
         return self.effect.name
+
+
+@dataclass(frozen=True)
+class Taken:
+    """A term of those that are asked for beside each other.
+
+    Args:
+        candidate: as the linear problem sees it beside those that were taken before it.
+        rivals: terms of its kind that were asked for until it was taken, and have less than half of their
+            evidence beside it; most evidence first.
+    """
+
+    candidate: Candidate
+    rivals: list[Candidate]
+
+
+@dataclass(frozen=True)
+class Pool:
+    """What the counts ask for beside a fit.
+
+    Args:
+        candidates: every term that the fit does not have yet, most evidence first.
+        together: terms that are asked for beside each other, see :func:`together`.
+    """
+
+    candidates: list[Candidate]
+    together: list[Taken]
 
 
 def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
@@ -114,9 +144,16 @@ def patches_for(rows: int) -> int:
 
 
 def ask(
-    fit: SurfelFit, split: Split, scan: Scan, most: int, seed: int, only: Container[str] | None = None
-) -> list[Candidate]:
-    """Every term that the fit does not have yet, most evidence first.
+    fit: SurfelFit,
+    split: Split,
+    scan: Scan,
+    most: int,
+    seed: int,
+    least: float = math.inf,
+    room: int = 0,
+    only: Container[str] | None = None,
+) -> Pool:
+    """Every term that the fit does not have yet.
 
     Args:
         fit: that is criticised.
@@ -124,46 +161,146 @@ def ask(
         scan: of the capture.
         most: fitted spots that are looked at.
         seed: of their choice.
+        least: nats that a term needs to be taken.
+        room: for terms that are taken together.
         only: names of those that are asked; None asks all.
 
     Returns:
-        one candidate a term, with a copy of it at its best shape.
+        candidates with a copy of each effect at its best shape, and those that are asked for together.
     """
     problem, block = _problem(fit, split, most, seed)
+    projector = Projector(problem)
     have = {e.name for e in fit.extension.effects}
     terms = [e for e in [*EFFECTS, *FREE] if only is None or e.name in only]
-    return screen(problem, [e(scan) for e in terms if e.name not in have], block)
+    found = screen(problem, projector, [e(scan) for e in terms if e.name not in have], block)
+    return Pool(found, together(problem, projector, block, found, least, room))
 
 
-def own_evidence(fit: SurfelFit, split: Split, most: int, seed: int, name: str) -> tuple[float, float]:
-    """How much the counts ask for a term that a fit has, beside all else that the fit has and may do.
+def together(
+    problem: Problem,
+    projector: Projector,
+    block: Tensor,
+    candidates: list[Candidate],
+    least: float,
+    room: int,
+) -> list[Taken]:
+    """Terms that are asked for beside each other: each beside all that were taken before it.
+
+    Strong faults hide one another, and the same trace may be that of several terms. So the one that is asked
+    for most is taken, its columns go to what the base can do by itself, and all others are asked again. Of
+    those that have most of the largest evidence the simplest is taken; free terms come after all effects, for
+    what these leave.
 
     Args:
-        fit: with the term at its fitted value.
+        problem: of the tested spots.
+        projector: of it.
+        block: ``[S]`` number of each spot's wall block.
+        candidates: the pool; terms with a number for each spot are not taken.
+        least: nats that a term needs.
+        room: for so many.
+
+    Returns:
+        in the order in which they were taken.
+    """
+    loud = [c for c in candidates if c.loud > least and not c.effect.per_spot] if room else []
+    taken: list[Taken] = []
+    raw, freed = dict[str, Tensor](), dict[str, Tensor]()
+    known: list[tuple[Tensor, Tensor]] = []  # columns without what the base can do, and their precision
+
+    def beside(left: list[Candidate]) -> list[Candidate]:
+        """The same terms, asked again beside those that were taken."""
+        if not known:
+            return left
+        columns, precision = (torch.cat(parts, -1) for parts in zip(*known, strict=True))
+        other, found = projector.beside(columns, precision), []
+        for c in left:
+            z = other.free(freed[c.name])
+            found.append(_seen_again(c, _evidence(problem, other, c.effect, raw[c.name], z, block)))
+        return found
+
+    for free in (False, True):
+        asked = [c for c in loud if (c.name in FREE_NAMES) == free]
+        for c in asked if len(taken) < room else []:
+            raw[c.name] = weighted_columns(problem, c.effect)
+            freed[c.name] = projector.free(raw[c.name])
+        asked = beside(asked) if len(taken) < room else []
+        while len(taken) < room:
+            best = max((c.evidence for c in asked), default=0.0)
+            near = [c for c in asked if c.evidence > max(least, MOST * best)]
+            if not near:
+                break
+            first = min(near, key=lambda c: (len(c.step), -c.evidence))
+            deviation = prior_deviations(first.effect)
+            known.append((freed[first.name], (first.scale * deviation).pow(-2).float()))
+            before = [c for c in asked if c is not first]
+            asked = beside(before)
+            lost = [
+                c for c, now in zip(before, asked, strict=True) if c.evidence > max(least, 2 * now.evidence)
+            ]
+            taken.append(Taken(first, sorted(lost, key=lambda c: -c.evidence)))
+            asked = [c for c in asked if c.loud > least]
+    return taken
+
+
+def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:
+    """The same term beside others; another shape of it may be the best, but that is asked once others are in
+    the model.
+    """
+    nats = found.nats - math.log(len(candidate.effect.shape_grid()))
+    loud = max(nats, found.loud - math.log(len(candidate.effect.shape_grid())))
+    effect = _with_scale(copy.deepcopy(candidate.effect), found)
+    seen = replace(candidate, effect=effect, evidence=nats, loud=loud, scale=found.scale)
+    return replace(seen, step=found.step, error=found.error, retained=found.retained, scatter=found.scatter)
+
+
+def own_evidence(
+    fit: SurfelFit, split: Split, most: int, seed: int, names: list[str]
+) -> dict[str, tuple[float, float]]:
+    """How much the counts ask for each of several terms that a fit has, beside all else that the fit has and
+    may do.
+
+    Args:
+        fit: with the terms at their fitted values.
         split: of its spots.
         most: fitted spots that are looked at.
         seed: of their choice.
-        name: of the term.
+        names: of the terms.
 
     Returns:
-        nats and ``lit``, as of a candidate.
+        nats and ``lit``, as of a candidate, by name.
     """
-    effect = next(e for e in fit.extension.effects if e.name == name)
-    problem, block = _problem(fit, split, most, seed, without=effect)
-    shapes = len(effect.shape_grid())
+    problem, block = _problem(fit, split, most, seed, with_effects=False)
+    whole = Projector(problem)
+    effects = {e.name: e for e in fit.extension.effects}
+    columns = {n: weighted_columns(problem, e, shapes=True) for n, e in effects.items() if not e.per_spot}
+    freed = {n: whole.free(z) for n, z in columns.items()}
+
+    def one(name: str) -> tuple[float, float]:
+        effect, others = effects[name], [n for n in freed if n != name]
+        many = math.log(len(effect.shape_grid()))
+        z = torch.cat([whole.left[:, :0], *(freed[n] for n in others)], 1)
+        precision = torch.cat([whole.left.new_zeros(0), *(effects[n].precision() for n in others)])
+        at = _above_null(effect)
+        if effect.per_spot:
+            column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
+            beside = whole.beside(z, precision)
+            score, information, _ = _scores(problem, beside, effect, column, at[problem.spots])
+            return best_width(score, information, sparse(effect))[0] - many, _lit(problem, effect, column)
+        k = len(at)
+        beside = whole.beside(z, precision, whole.left[:, 0] + freed[name][:, :k] @ at)
+        own = (columns[name][:, :k], beside.free(freed[name][:, :k]))
+        found = _evidence(problem, beside, effect, *own, block)
+        return found.nats - many, found.lit
+
+    return {name: one(name) for name in names}
+
+
+def _above_null(effect: Effect) -> Tensor:
+    """``[k]`` how far an effect's stored amplitudes lie from their nulls."""
     null = copy.deepcopy(effect)
     for p in null.amplitudes:
         null.set(p.name, 0.0 if p.null is None else p.null)
-    at = _amplitudes(effect) - _amplitudes(null)
-    columns = weighted_columns(problem, effect)
-    if effect.per_spot:
-        column = columns[:, 0].view(problem.expected.shape)
-        score, information, _ = _scores(problem, Projector(problem), effect, column, at[problem.spots])
-        nats = best_width(score, information, sparse(effect))[0]
-        return nats - math.log(shapes), _lit(problem, effect, column)
-    projector = Projector(replace(problem, residual=problem.residual + columns @ at))
-    found = _evidence(problem, projector, effect, columns, projector.free(columns), block)
-    return found.nats - math.log(shapes), found.lit
+    return _amplitudes(effect) - _amplitudes(null)
 
 
 def _lit(problem: Problem, effect: Effect, column: Tensor) -> float:
@@ -176,30 +313,30 @@ def _amplitudes(effect: Effect) -> Tensor:
 
 
 def _problem(
-    fit: SurfelFit, split: Split, most: int, seed: int, without: Effect | None = None
+    fit: SurfelFit, split: Split, most: int, seed: int, with_effects: bool = True
 ) -> tuple[Problem, Tensor]:
     """The linear problem of a fit's tested spots, and the number of each one's wall block."""
     rows = tested_rows(fit, split, most, seed)
     spots = torch.from_numpy(split.fit[rows])
     patches = patches_for(len(rows) * fit.counts.shape[1])
     problem = build_problem(
-        fit.model, fit.extension, spots, fit.counts[rows], patches=patches, without=without
+        fit.model, fit.extension, spots, fit.counts[rows], with_effects=with_effects, patches=patches
     )
     return problem, torch.from_numpy(np.unique(split.block[split.fit[rows]], return_inverse=True)[1])
 
 
-def screen(problem: Problem, effects: list[Effect], block: Tensor) -> list[Candidate]:
+def screen(problem: Problem, projector: Projector, effects: list[Effect], block: Tensor) -> list[Candidate]:
     """Evidence of several terms.
 
     Args:
         problem: of the tested spots.
+        projector: of it.
         effects: at their nulls; they stay there.
         block: ``[S]`` number of each spot's wall block.
 
     Returns:
         one candidate an effect, most evidence first.
     """
-    projector = Projector(problem)
     effects = [copy.deepcopy(e) for e in effects]
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
     others = (e for e in effects if not e.per_spot)
@@ -228,19 +365,15 @@ def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate
     shape, best = max(tried, key=lambda entry: (entry[1].nats, entry[1].loud))
     mean = mean_factor([e.nats for _, e in tried], len(effect.shape_grid()))
     effect.set_all(shape)
-    if bool(effect.precision().any()) and best.scale:
-        effect.prior_scale = best.scale
-    return Candidate(
-        effect,
-        mean,
-        best.retained,
-        best.scatter,
-        shape,
-        best.step,
-        best.error,
-        max(mean, best.loud),
-        best.lit,
-    )
+    told = (mean, best.retained, best.scatter, shape, best.step, best.error, max(mean, best.loud), best.lit)
+    return Candidate(_with_scale(effect, best), *told, best.scale)
+
+
+def _with_scale(effect: Effect, found: Evidence) -> Effect:
+    """The effect, its prior as wide as the counts ask for."""
+    if bool(effect.precision().any()) and found.scale:
+        effect.prior_scale = found.scale
+    return effect
 
 
 def mean_factor(nats: list[float], number: int) -> float:

@@ -143,7 +143,7 @@ def _toy(
 ) -> None:
     torch.set_num_threads(1)
     fit = pipeline(capture, split, seed)
-    pool = ask(fit, split, Scan.of(capture), settings.spots, seed)
+    pool = ask(fit, split, Scan.of(capture), settings.spots, seed).candidates
     part = store / f".toy_{seed}.json"
     part.write_text(json.dumps({"largest": pool[0].evidence, "term": pool[0].name}))
     part.rename(store / f"toy_{seed}.json")

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlos_lit.inference.advise import AGAIN
-from nlos_lit.inference.criticise import Turn
+from nlos_lit.inference.criticise import Member
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.report.quantities import number, percent
 from nlos_lit.report.verdict import at_noise, excess_share, follows, invisible, rivals
-from nlos_lit.report.words import describe
+from nlos_lit.report.words import capital, describe
 
 # What tells where something without a name comes from, by the axis that it lies along.
 TELLS = {
@@ -144,26 +144,21 @@ def advised(term: Accepted) -> str:
     return f" By calculation {best} would tell {most} nats, the same scan again {number(again, 2)}."
 
 
-def told_turn(count: int, turn: Turn) -> str:
-    """What one turn of a diagnosis found, while the diagnosis goes on.
+def told_member(member: Member) -> str:
+    """What is known of a term that was tried, while the diagnosis goes on.
 
     Args:
-        count: of the turn, from 1.
-        turn: that has ended.
+        member: the term.
 
     Returns:
         a sentence.
     """
-    if turn.best is None:
-        return f"Turn {count}: nothing more is asked for."
-    phrase, found = describe(turn.best.name).phrase, turn.confirmed
-    nats = ""
-    if found is not None and turn.accepted and found.evidence < found.needed:
-        nats = f" ({percent(found.explained)} of what other spots leave unexplained without it)"
-    elif found is not None:
-        nats = f" ({number(found.evidence)} nats beside a fine scene, {number(found.needed)} needed)"
-    verb = "the simulation was extended by" if turn.accepted else "not confirmed:"
-    return f"Turn {count}: {verb} {phrase}{nats}."
+    phrase, found = describe(member.name).phrase, member.confirmed
+    if found is None:
+        return f"{capital(phrase)}: tried."
+    nats = f"{number(found.evidence)} nats beside all else, {number(found.needed)} needed"
+    share = f"{percent(found.explained)} of what other spots leave unexplained without it"
+    return f"{capital(phrase)}: {'holds' if member.accepted else 'does not hold'} ({nats}; {share})."
 
 
 def _of_nothing(diagnosis: Diagnosis) -> str:

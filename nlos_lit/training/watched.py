@@ -11,11 +11,11 @@ from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.volume_grid import VolumeGrid
-from nlos_lit.inference.criticise import Findings, Turn
+from nlos_lit.inference.criticise import Findings, Member
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.io.files import plain
 from nlos_lit.io.views import read_view
-from nlos_lit.report.advice import confidence, next_step, told_turn
+from nlos_lit.report.advice import confidence, next_step, told_member
 from nlos_lit.report.together import told_apart
 from nlos_lit.report.verdict import tone, verdict
 from nlos_lit.surfels.fit import SurfelFit
@@ -41,7 +41,7 @@ class WatchedDiagnosis:
         keep(self.folder, view_of(self.capture, {}, Scene(), facts))
 
     def turn(
-        self, image: tuple[Tensor, VolumeGrid], base: SurfelFit, present: SurfelFit, turns: Sequence[Turn]
+        self, image: tuple[Tensor, VolumeGrid], base: SurfelFit, present: SurfelFit, members: Sequence[Member]
     ) -> None:
         """Show what was found so far.
 
@@ -49,11 +49,11 @@ class WatchedDiagnosis:
             image: ``[nz, nx, ny]`` and its grid.
             base: fine fit without effects.
             present: fine fit with what was accepted.
-            turns: that have ended.
+            members: terms that were tried so far.
         """
         self.image = image
         said = ["The diagnosis goes on: asking what the simulation misses."]
-        said += [told_turn(k, turn) for k, turn in enumerate(turns, 1)]
+        said += [told_member(member) for member in members]
         self._keep(base, present, "running", said)
 
     def finish(self, found: Findings, diagnosis: Diagnosis, given: Sequence[str] = ()) -> None:
