@@ -36,6 +36,7 @@ Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 PREDICTED = 0.25  # of what select spots leave unexplained without a term: who explains that much is believed
+EVEN = 0.5  # weight from which on a scene predicts better rather than worse than another
 WARM = 120  # batches, and as many again at falling rate
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 
@@ -102,7 +103,8 @@ class Confirmed:
     Args:
         evidence: its own, nats.
         needed: nats.
-        gain: of the select spots over the same scene gone on without it.
+        gain: of the select spots over the scene without it: gone on with, or built anew, whichever leaves it
+            less.
         weight: how far the capture leaves open that it predicts better than that one.
         explained: share of what the select spots leave unexplained without it.
     """
@@ -112,6 +114,11 @@ class Confirmed:
     gain: Comparison
     weight: float
     explained: float = 0.0
+
+    @property
+    def asked_for(self) -> bool:
+        """By its own evidence, which other spots do not contradict."""
+        return self.evidence > self.needed and self.weight > EVEN
 
 
 @dataclass(frozen=True)
@@ -369,15 +376,19 @@ class Loop:
         text = f"refining the scene {name.replace('_', ' ')}"
         return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
 
-    def hold(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
+    def hold(
+        self, members: list[Member], scene: SurfelFit, coarse: SurfelFit | None = None
+    ) -> tuple[list[Member], SurfelFit]:
         """Which of some terms hold, beside each other.
 
         The least of those that do not hold leaves, a free term before an effect, and all that stay are asked
-        again: of two that stand for each other neither is missed.
+        again: of two that stand for each other neither is missed. Those that hold so are asked once more,
+        beside parsimonious scenes.
 
         Args:
             members: whose terms the scene has.
             scene: with all of them.
+            coarse: the parsimonious scene with all of them, where it is to be asked.
 
         Returns:
             The same members, accepted or not, with none and itself as trials where they are, and the scene
@@ -387,7 +398,9 @@ class Loop:
         while staying:
             asked = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            failing = [pair for pair in asked if not pair[0].accepted]
+            if coarse is not None and all(m.accepted for m in staying):
+                staying = self._anew(staying, coarse)
+            failing = [(m, fit) for m, (_, fit) in zip(staying, asked, strict=True) if not m.accepted]
             if not failing:
                 break
             worst, scene = min(failing, key=lambda pair: (not pair[0].free, _gain(pair[0])))
@@ -395,6 +408,47 @@ class Loop:
             left[worst.name] = worst
         now = {m.name: m for m in staying} | left
         return [now[m.name] for m in members], scene
+
+    def _anew(self, members: list[Member], coarse: SurfelFit) -> list[Member]:
+        """Members that hold, asked against parsimonious scenes that were built without them.
+
+        A scene that has bent itself to a term cannot go on without it as well as one that never had it.
+        """
+        names = [m.name for m in members]
+        scene = self.only(coarse, names)
+        value, found = log_likelihood(scene, self.split.select), []
+        self.steps.plan(fit=len(names))
+        for member in members:
+            kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
+            make = partial(self._without_it, scene, member.name)
+            fit = self.steps("fit", f"rebuilding the scene without {member.name}", kept, make)
+            gain, weight, explained = self._gained(fit, value)
+            old = member.confirmed
+            assert old is not None
+            least = gain if gain.nats < old.gain.nats else old.gain
+            now = replace(
+                old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
+            )
+            found.append(replace(member, confirmed=now, accepted=self._holds(member, now, len(members))))
+        return found
+
+    def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
+        """A parsimonious scene without a term: gone on with, or built anew, whichever predicts better."""
+        gone = self.without(scene, [name])
+        other = _rebuilt(self.rebuild, gone.extension, self.seed)
+        return gone if other is None else self.better(other, gone)
+
+    def _gained(self, without: SurfelFit, value: Tensor) -> tuple[Comparison, float, float]:
+        """What select spots gain over a scene without a term, its weight, and the share that it explains."""
+        select, before = self.split.select, log_likelihood(without, self.split.select)
+        gain = compare(before, value, self.block)
+        explained = gain.nats / max(misfit_of(without, select, len(select)), gain.nats, 1e-9)
+        return gain, weights([before, value], self.block)[1], explained
+
+    def _holds(self, member: Member, found: Confirmed, number: int) -> bool:
+        """By its own evidence, or among others by what it explains."""
+        share = number > 1 and not _of_spots(member) and found.explained > PREDICTED
+        return found.asked_for or (share and found.weight > 1 - self.settings.open_share)
 
     def _asked(self, members: list[Member], scene: SurfelFit) -> list[tuple[Member, SurfelFit]]:
         """Each of some terms, asked beside the others, and the scene gone on without it."""
@@ -410,18 +464,14 @@ class Loop:
         own = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
         misfit, value, found = self._misfit(scene), log_likelihood(whole, select), []
         for member, fit in zip(members, fewer, strict=True):
-            before, (evidence, lit) = log_likelihood(fit, select), own[member.name]
-            gain, weight = compare(before, value, self.block), weights([before, value], self.block)[1]
-            explained = gain.nats / max(misfit_of(fit, select, len(select)), gain.nats, 1e-9)
-            needed = self.least + s.share * lit * misfit
-            asked_for = evidence > needed or (
-                len(members) > 1 and not _of_spots(member) and explained > PREDICTED
-            )
-            confirmed = Confirmed(evidence, needed, gain, weight, explained)
+            gain, weight, explained = self._gained(fit, value)
+            evidence, lit = own[member.name]
+            confirmed = Confirmed(evidence, self.least + s.share * lit * misfit, gain, weight, explained)
+            before = log_likelihood(fit, select)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
-            yes = asked_for and weight > 1 - s.open_share
-            found.append((replace(member, confirmed=confirmed, accepted=yes, trials=trials), fit))
+            holds = self._holds(member, confirmed, len(members))
+            found.append((replace(member, confirmed=confirmed, accepted=holds, trials=trials), fit))
         return found
 
     def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
@@ -450,9 +500,9 @@ class Loop:
             members, scene = [now.get(m.name, m) for m in members] + staying[-1:], with_it
 
     def predicts(self, scene: SurfelFit, other: SurfelFit) -> bool:
-        """Whether a scene predicts the select spots better than another, whatever blocks had been drawn."""
+        """Whether a scene predicts the select spots rather better than another."""
         values = [log_likelihood(fit, self.split.select) for fit in (other, scene)]
-        return weights(values, self.block)[1] > 1 - self.settings.open_share
+        return weights(values, self.block)[1] > EVEN
 
     def named(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """The terms that hold, each held against its rivals.
@@ -471,13 +521,13 @@ class Loop:
             scene = self.gone_on(bare, [new.candidate for _, new in other])
         return settled, scene
 
-    def only(self, fit: SurfelFit, names: set[str]) -> SurfelFit:
+    def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """The same scene, gone on without all other terms, where it has any."""
         others = [e.name for e in fit.extension.effects if e.name not in names]
         if not others:
             return fit
-        text = f"going on without {', '.join(others)}"
-        return self.steps("fit", text, "only_what_holds", partial(self.without, fit, others))
+        text, kept = f"going on without {', '.join(others)}", f"only_{'_'.join(names)}"
+        return self.steps("fit", text, kept, partial(self.without, fit, others))
 
     def needed(self, fit: SurfelFit) -> float:
         """Nats of own evidence that a term needs beside a fine scene, if it acts where its light falls."""
@@ -587,11 +637,11 @@ def criticise(
     scene = first
     if found.members:
         scene = loop.better(loop.fine(coarse, "with_all"), coarse)
-        found.members, scene = loop.hold(found.members, scene)
+        found.members, scene = loop.hold(found.members, scene, coarse)
     found.members, scene = loop.single_spots(found.members, scene)
     if found.accepted and loop.predicts(scene, first):
         found.members, found.final = loop.named(found.members, scene)
-        found.again = loop.only(coarse, {m.name for m in found.accepted})
+        found.again = loop.only(coarse, [m.name for m in found.accepted])
     else:
         found.members = [replace(m, accepted=False) for m in found.members]
     told(first, found.final, found.members)

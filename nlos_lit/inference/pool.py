@@ -172,7 +172,7 @@ def ask(
     projector = Projector(problem)
     have = {e.name for e in fit.extension.effects}
     terms = [e for e in [*EFFECTS, *FREE] if only is None or e.name in only]
-    found = screen(problem, projector, [e(scan) for e in terms if e.name not in have], block)
+    found = screen(problem, [e(scan) for e in terms if e.name not in have], block, projector)
     return Pool(found, together(problem, projector, block, found, least, room))
 
 
@@ -325,18 +325,21 @@ def _problem(
     return problem, torch.from_numpy(np.unique(split.block[split.fit[rows]], return_inverse=True)[1])
 
 
-def screen(problem: Problem, projector: Projector, effects: list[Effect], block: Tensor) -> list[Candidate]:
+def screen(
+    problem: Problem, effects: list[Effect], block: Tensor, projector: Projector | None = None
+) -> list[Candidate]:
     """Evidence of several terms.
 
     Args:
         problem: of the tested spots.
-        projector: of it.
         effects: at their nulls; they stay there.
         block: ``[S]`` number of each spot's wall block.
+        projector: of the problem; None makes one.
 
     Returns:
         one candidate an effect, most evidence first.
     """
+    projector = projector or Projector(problem)
     effects = [copy.deepcopy(e) for e in effects]
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
     others = (e for e in effects if not e.per_spot)

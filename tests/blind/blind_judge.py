@@ -133,7 +133,7 @@ def run_case(spec: Spec, options: CriticismSettings, oracle: bool = True) -> Out
 def oracle_gain(truth: Truth, found: Findings, capture: Capture, before: torch.Tensor) -> Comparison:
     """Nats on the select spots of a fine scene that is rebuilt with the true effects."""
     split, pipeline = split_spots(capture), pipeline_for(capture)
-    candidates = [c for c in found.turns[0].candidates if c.name in truth.names]
+    candidates = [c for c in found.pools[0].candidates if c.name in truth.names]
     extension = begun_with(found.base, candidates)
     anew = pipeline.grow(pipeline.fit(capture, split, pipeline.image(capture), extension, 0), 0)
     return compare(before, log_likelihood(solve_spots(anew), split.select), split.block[split.select])

@@ -26,7 +26,7 @@ def tried(capture: Capture, held: Effect | None = None) -> tuple[dict[str, Surfe
     base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
     begun = {
         c.name: begun_with(base, [c])
-        for c in ask(base, split, lit_by(base, scan), OPTIONS.spots, 0, (DRIFT, MAP))
+        for c in ask(base, split, lit_by(base, scan), OPTIONS.spots, 0, only=(DRIFT, MAP)).candidates
     }
     if held is not None:
         kept = type(held)(scan)

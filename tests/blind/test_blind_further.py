@@ -63,7 +63,7 @@ def first(tmp_path_factory) -> Diagnosis:
     base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
     none = log_likelihood(go_on(base.copy(begun_with(base, []), 0)), split.select)
     tried = {}
-    for candidate in ask(base, split, lit_by(base, scan), OPTIONS.spots, 0, (DRIFT, MAP)):
+    for candidate in ask(base, split, lit_by(base, scan), OPTIONS.spots, 0, only=(DRIFT, MAP)).candidates:
         fit = go_on(base.copy(begun_with(base, [candidate]), 0))
         nats = nats_by_block(none, log_likelihood(fit, split.select), split)
         tried[candidate.name] = tried_with(candidate.name, fit, nats)

@@ -14,7 +14,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import criticise
 from nlos_lit.inference.criticise import CriticismSettings, Loop
 from nlos_lit.inference.distil import Follower, distil, laid_through
-from nlos_lit.inference.heldout import Comparison
+from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
 from nlos_lit.inference.split import split_spots
 from nlos_lit.runtime.steps import Steps
 
@@ -41,14 +41,14 @@ def followed(factor: np.ndarray) -> dict[str, Follower]:
     fit = fit_of(model, measured, Extension([effect_of("free_scan", scan)]), split.fit)
     fit.run(1, steps=100, settle=False)
     loop = Loop(None, None, split, scan, CriticismSettings(processes=1), 0, Steps())
-    return distil(loop, accepting(fit, "free_scan", loop.losses(fit)))
+    value, less = (log_likelihood(f, split.select) for f in (fit, loop.without(fit, ["free_scan"])))
+    return distil(loop, accepting(fit, "free_scan", compare(less, value, loop.block)))
 
 
-def accepting(fit: object, term: str, losses: dict[str, Comparison]) -> SimpleNamespace:
+def accepting(fit: object, term: str, gain: Comparison) -> SimpleNamespace:
     """Findings of a loop that accepted one term."""
-    return SimpleNamespace(
-        final=fit, accepted=[SimpleNamespace(best=SimpleNamespace(name=term))], losses=losses
-    )
+    member = SimpleNamespace(name=term, trial=SimpleNamespace(gain=gain))
+    return SimpleNamespace(final=fit, accepted=[member])
 
 
 def test_a_jump_is_told_by_its_place_and_height():
@@ -76,9 +76,7 @@ def test_what_follows_no_formula_is_not_offered():
 
 def test_a_map_of_the_wall_follows_no_formula_of_one_axis():
     loop = SimpleNamespace(settings=None, split=SimpleNamespace(select=None))
-    assert (
-        distil(loop, accepting(None, "free_wall", {"free_wall": Comparison(50.0, 1.0, (48.0, 52.0))})) == {}
-    )
+    assert distil(loop, accepting(None, "free_wall", Comparison(50.0, 1.0, (48.0, 52.0)))) == {}
 
 
 @pytest.mark.parametrize(("share", "offered"), [(0.899, False), (0.9, True)])

@@ -16,12 +16,19 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference import pool
 from nlos_lit.inference.advise import plans
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
-from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Trial, Turn
-from nlos_lit.inference.evidence import UNEVENNESS, Projector
+from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Member, Trial
+from nlos_lit.inference.evidence import (
+    UNEVENNESS,
+    Projector,
+    best_evidence,
+    prior_deviations,
+    step_bounds,
+)
 from nlos_lit.inference.heldout import Comparison
-from nlos_lit.inference.pool import Candidate
+from nlos_lit.inference.pool import Candidate, Pool, own_evidence
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.residuals import SIDE
 from nlos_lit.inference.split import split_spots
@@ -233,17 +240,16 @@ def findings():
         found_candidate(n, scan, e)
         for n, e in (("irf_tail", 500.0), ("afterpulsing", 400.0), ("free_wall", 90.0), ("free_time", 4.0))
     ]
-    won, second = trial("irf_tail", 500.0, 300.0, 0.6), trial("free_wall", 90.0, 60.0, 0.9)
+    won, second = trial("irf_tail", 500.0, 250.0, 0.6), trial("free_wall", 90.0, 60.0, 0.9)
     rival, beside = trial("afterpulsing", 400.0, 290.0, 0.2), trial("free_wall", 90.0, 80.0, 0.1)
     control = Trial(None, base, nothing, Comparison(1.0, 1.0, (-1, 3)), 0.1)
     group = {"irf_tail": 0.6, "afterpulsing": 0.2, "free_wall": 0.2}
-    turns = [
-        Turn(first, 8.0, frozenset(), [won, rival, beside, control], won, group, kept(450.0), True),
-        Turn(first[1:], 8.0, frozenset(), [second, control], second, {"free_wall": 1.0}, kept(80.0), True),
-        Turn(first[3:], 8.0),
+    members = [
+        Member(first[0], first[1:3], kept(450.0), True, [won, rival, beside, control], group),
+        Member(first[2], (), kept(80.0), True, [second, control], {"free_wall": 1.0}),
+        Member(first[1], (), kept(2.0)),
     ]
-    losses = {"irf_tail": Comparison(250.0, 5.0, (240, 260)), "free_wall": Comparison(60.0, 5.0, (50, 70))}
-    return Findings(base, final, turns, losses), measured, split, scan
+    return Findings(base, final, 8.0, [Pool(first, []), Pool(first[3:], [])], members), measured, split, scan
 
 
 def diagnosed(findings, null: Null | None = None):
@@ -268,7 +274,7 @@ def test_what_is_said_of_accepted_terms(findings):
     photons, bins = measured.gated_counts()[split.select].sum(), len(split.select) * 58
     gain = tail.heldout_gain
     assert gain.nats_per_photon == pytest.approx(250 / photons)
-    assert gain.ci95 == pytest.approx((240 / photons, 260 / photons))
+    assert gain.ci95 == pytest.approx((248 / photons, 252 / photons))
     assert gain.deviance_per_bin_after == pytest.approx(said.extended.deviance_per_bin)
     assert gain.deviance_per_bin_before - gain.deviance_per_bin_after == pytest.approx(500 / bins)
     assert (free.name, free.axis, free.weights) == ("free_wall", "wall", {"free_wall": 1.0})
@@ -284,11 +290,11 @@ def test_what_is_said_of_accepted_terms(findings):
 
 @FORWARD_MODE
 def test_without_an_unknown_term_the_likeliest_axis_is_told(findings):
-    """Of the last turn's pool, which does not make it significant."""
+    """Of the last pool, which does not make it significant."""
     found, *rest = findings
     only = Extension([found.final.extension.effects[0]])
     fit = fit_of(found.final.model, rest[0], only, rest[1].fit)
-    calm = dataclasses.replace(found, final=fit, turns=[found.turns[0], found.turns[2]])
+    calm = dataclasses.replace(found, final=fit, members=found.members[:1])
     said = diagnosed((calm, *rest))
     assert [e.name for e in said.effects] == ["irf_tail"]
     assert said.unknown == []
@@ -296,6 +302,29 @@ def test_without_an_unknown_term_the_likeliest_axis_is_told(findings):
     assert (left.significant, left.axis, left.evidence) == (False, "time", 4)
     # The map is no longer accepted, and so is a rival again.
     assert set(said.effects[0].weights) == {"irf_tail", "afterpulsing", "free_wall"}
+
+
+@FORWARD_MODE
+def test_own_evidence_is_that_of_the_term_left_out(findings):
+    """As if the model had all else, and the counts were asked for it from where its absence leaves them."""
+    found, measured, split, _ = findings
+    fit = fit_of(found.final.model, measured, found.final.extension, split.fit)
+    asked = own_evidence(fit, split, 48, 3, ["irf_tail", "free_wall"])
+    rows = pool.tested_rows(fit, split, 48, 3)
+    spots, block = torch.from_numpy(split.fit[rows]), torch.from_numpy(split.block[split.fit[rows]])
+    for effect in fit.extension.effects:
+        problem = build_problem(fit.model, fit.extension, spots, fit.counts[rows], without=effect)
+        z = weighted_columns(problem, effect)
+        at = getattr(effect, f"raw_{effect.amplitudes[0].name}").detach()
+        projector = Projector(dataclasses.replace(problem, residual=problem.residual + z @ at))
+        own = (prior_deviations(effect), step_bounds(effect))
+        nats = best_evidence(projector, z.view(48, 58, -1), projector.free(z), block, *own)
+        many = math.log(len(effect.shape_grid()))
+        assert asked[effect.name] == (
+            pytest.approx(nats.nats - many, rel=1e-3),
+            pytest.approx(nats.lit, rel=1e-3),
+        )
+    assert asked["irf_tail"][0] > 20
 
 
 @FORWARD_MODE

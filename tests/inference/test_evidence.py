@@ -224,6 +224,30 @@ def marginal(r: Tensor, x: Tensor, wide: list[tuple[Tensor, float]]) -> float:
 UNEVEN_ROWS = normal(ROWS, 20, seed=31)
 
 
+@pytest.mark.parametrize("number", [0, 3])
+def test_terms_are_taken_off_like_nuisance(number):
+    """A projector beside some terms says what one does that had them among its nuisance from the start."""
+    x, t, z, r = (
+        normal(ROWS, 5, seed=1),
+        normal(ROWS, number, seed=4),
+        normal(ROWS, 2, seed=6),
+        normal(ROWS, seed=2),
+    )
+    r, z = r + UNEVEN_ROWS @ (0.2 * normal(20, seed=3)) + 2 * t.sum(1), z + t.sum(1, keepdim=True)
+    prior, precision = torch.tensor([0.0, 3.0, 0.0, 0.0, 50.0]), torch.tensor([0.5, 4.0, 100.0])[:number]
+    first = Projector(problem(r, x, prior, UNEVEN_ROWS))
+    beside = first.beside(first.free(t), precision)
+    whole = Projector(problem(r, torch.cat([x, t], 1), torch.cat([prior, precision]), UNEVEN_ROWS))
+    assert beside.width == whole.width
+    assert torch.allclose(beside.levels, whole.levels, atol=1e-3)
+    off, same = beside.even(beside.free(first.free(z)), beside.width), whole.off(z)
+    assert torch.allclose(off.T @ off, same.T @ same, rtol=1e-4)
+    assert torch.allclose(off.T @ beside.residual, same.T @ whole.residual, rtol=1e-4, atol=1e-3)
+    other = first.beside(first.free(t), precision, first.left[:, 0] + first.free(z)[:, 0])
+    moved = Projector(problem(r + z[:, 0], torch.cat([x, t], 1), torch.cat([prior, precision]), UNEVEN_ROWS))
+    assert torch.allclose(off.T @ other.residual_at(0), same.T @ moved.residual_at(0), rtol=1e-3, atol=1e-2)
+
+
 def test_unevenness_is_what_the_counts_ask_for():
     """Against the marginal likelihood of the counts; left is what a prior of that width leaves."""
     x, w, r = normal(ROWS, 5, seed=1), UNEVEN_ROWS, normal(ROWS, seed=2)
@@ -456,6 +480,54 @@ def test_terms_are_projected_together(monkeypatch, known):
     assert [c.evidence for c in together] == sorted((c.evidence for c in together), reverse=True)
     assert [c.name for c in together] == [c.name for c in apart]
     assert [c.evidence for c in together] == pytest.approx([c.evidence for c in apart], abs=1e-3)
+
+
+ALIKE = {
+    "irf_tail": ([1.0, 0.0, 0.0], 0),
+    "afterpulsing": ([0.9, 0.1, 0.0], 0),
+    "pile_up": ([0.0, 0.0, 1.0], 0),
+    "vignetting": ([0.0, 0.0, 0.0], 1),
+    "free_rate": ([1.0, 0.0, 0.0], 9),
+}
+
+
+@pytest.fixture
+def alike(monkeypatch) -> list[Candidate]:
+    """What is asked for of terms some of which leave the same traces, as ``ALIKE`` says; the wide one can do
+    what the first does and more.
+    """
+    traces = normal(ROWS, 3, seed=21)
+
+    def made(problem, effect, *_, **__) -> Tensor:
+        shares, more = ALIKE[effect.name]
+        own = (traces @ torch.tensor(shares))[:, None] if any(shares) else normal(ROWS, 1, seed=30)
+        return torch.cat([own, normal(ROWS, more, seed=31)], 1) if len(shares) and any(shares) else own
+
+    monkeypatch.setattr(pool, "weighted_columns", made)
+    return traces
+
+
+def taken(
+    strengths: list[float], traces: Tensor, room: int, unknown: float = 0.0
+) -> list[tuple[str, list[str]]]:
+    more = unknown * normal(ROWS, 9, seed=31).sum(1)
+    whole = problem(traces @ torch.tensor(strengths) + more + normal(ROWS, seed=2))
+    projector = Projector(whole)
+    found = screen(whole, [effect_of(n, SCAN) for n in ALIKE], BLOCK, projector)
+    told = pool.together(whole, projector, BLOCK, found, 5.0, room)
+    return [(t.candidate.name, [c.name for c in t.rivals]) for t in told]
+
+
+def test_terms_are_asked_for_beside_those_that_were_taken(alike):
+    """The first leaves nothing for what looks like it, which is its rival; the other is asked for as before.
+    A free term that could do the same comes after all effects, when nothing is left for it.
+    """
+    assert taken([2.0, 0.0, 1.0], alike, 9) == [("irf_tail", ["afterpulsing"]), ("pile_up", [])]
+    assert taken([2.0, 0.0, 1.0], alike, 1) == [("irf_tail", ["afterpulsing"])]
+    assert taken([2.0, 0.0, 1.0], alike, 0) == []
+    assert taken([0.0, 0.0, 0.0], alike, 9) == []
+    names = [name for name, _ in taken([2.0, 0.0, 1.0], alike, 9, 0.5)]
+    assert (names[-1], len(names)) == ("free_rate", 3), "effects leave something to it"
 
 
 def test_a_term_with_a_prior_keeps_its_scale(known):

@@ -23,7 +23,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.criticise import begun_with
 from nlos_lit.inference.kept import kinds
-from nlos_lit.inference.pool import screen
+from nlos_lit.inference.pool import Pool, Taken, screen
 from nlos_lit.inference.problem import build_problem
 from nlos_lit.runtime.plain_file import read_plain, write_plain
 from nlos_lit.surfels.fit import SurfelFit
@@ -112,10 +112,12 @@ def test_a_pool_comes_back(tmp_path):
     problem = build_problem(model, fit.extension, spots, fit.counts)
     names = ("irf_tail", "hot_spots", "power_drift", "free_time", "free_wall_delay", "free_spot_gain")
     found = screen(problem, [effect_of(name, scan) for name in names], spots % 6)
-    again = kept(found, scan, tmp_path)
+    pool = kept(Pool(found, [Taken(found[1], found[2:4])]), scan, tmp_path)
+    again, (taken,) = pool.candidates, pool.together
+    assert [taken.candidate.name, *(c.name for c in taken.rivals)] == [c.name for c in found[1:4]]
     assert [type(c) for c in again] == [type(c) for c in found]
     for old, new in zip(found, again, strict=True):
-        numbers = ("name", "evidence", "retained", "scatter", "shape")
+        numbers = ("name", "evidence", "retained", "scatter", "shape", "loud", "lit", "scale")
         assert [getattr(new, n) for n in numbers] == [getattr(old, n) for n in numbers]
         assert (new.effect.prior_scale, new.effect.width) == (old.effect.prior_scale, old.effect.width)
         for name in ("step", "error"):

@@ -1,4 +1,4 @@
-"""The loop: with which terms a fit goes on, which is chosen, and whether a fine scene confirms it."""
+"""The loop: terms come together, and each must hold beside the others."""
 
 from __future__ import annotations
 
@@ -14,35 +14,32 @@ from torch import Tensor
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
+from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference import company, turns
+from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference import criticise as loop
 from nlos_lit.inference.criticise import (
     CriticismSettings,
     Findings,
     Loop,
+    Member,
     Trial,
-    Turn,
     begun_with,
     chosen,
     copy_effects,
+    criticise,
     group_of,
-    leaders,
     misfit_of,
-    needed,
     weighed,
 )
 from nlos_lit.inference.heldout import compare
-from nlos_lit.inference.pool import Candidate
-from nlos_lit.runtime.steps import Steps
+from nlos_lit.inference.pool import Candidate, Pool, Taken
 
 SCAN = Scan.of(capture_of(scattered(12)))
 SPLIT = SimpleNamespace(select=np.arange(120), fit=np.arange(300), block=BLOCK)
 SETTINGS = CriticismSettings(processes=1)
 NOTHING = torch.zeros(120, dtype=torch.float64)
-
-
-DUD = [candidate(n, 0.0) for n in ("hum", "crosstalk", "direct_leak")]
+LEAST = math.log((len(EFFECTS) + len(FREE)) / SETTINGS.level)
 
 
 def bar(values: Tensor) -> float:
@@ -86,11 +83,12 @@ class World:
     Args:
         table: nats of the select spots by names of effects; "fine" counts for a fine scene on top, "anew" for
             one from new seeds, and a sum of names in this order may have an entry of its own.
-        pool: all that is ever found.
-        own: evidence of terms beside a fine scene; that of the pool where nothing is said.
+        pool: all that is ever found; what has the evidence it needs is asked for together.
+        own: evidence of terms in the model; that of the pool where nothing is said.
+        beside: terms that show only where all of some others are in the model.
+        rivals: of terms, by name.
         impossible: effects with which no surfel survives a rebuild.
-        misfit: nats that every fine scene leaves of select spots. taken_up: of the fitted spots, fewer.
-        together: what is refused is asked for in company.
+        misfit: nats that every scene leaves of select spots. taken_up: of the fitted spots, fewer.
     """
 
     def __init__(
@@ -99,24 +97,22 @@ class World:
         table: dict[str, Tensor],
         pool: list[Candidate],
         own: dict[str, float] | None = None,
+        beside: dict[str, set[str]] | None = None,
+        rivals: dict[str, list[str]] | None = None,
         impossible: tuple[str, ...] = (),
         misfit: float = 0.0,
         taken_up: float = 0.0,
-        together: bool = False,
     ) -> None:
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
-        self.together = together
+        self.beside, self.rivals = beside or {}, rivals or {}
         self.rebuilt: list[tuple[frozenset[str], int]] = []
         self.grown: list[frozenset[str]] = []
-        self.asked: list[bool] = []
-        for module in (loop, company):
-            monkeypatch.setattr(module, "log_likelihood", self.likelihood)
+        monkeypatch.setattr(loop, "solve", lambda *_: None)
+        monkeypatch.setattr(loop, "log_likelihood", self.likelihood)
         monkeypatch.setattr(loop, "ask", self.ask)
         monkeypatch.setattr(loop, "own_evidence", self.own_evidence)
         by = {len(SPLIT.select): misfit, len(SPLIT.fit): misfit - taken_up}
         monkeypatch.setattr(loop, "misfit_of", lambda fit, spots, number: by[len(spots)] * number / 300)
-        if not together:
-            monkeypatch.setattr(turns, "in_company", lambda *_: None)
 
     def likelihood(self, fit: FakeFit, spots: np.ndarray) -> Tensor:
         assert np.array_equal(spots, SPLIT.select)
@@ -125,17 +121,19 @@ class World:
             return self.table["+".join(names)]
         return sum((self.table[n] for n in names if n in self.table), NOTHING)
 
-    def ask(self, fit: FakeFit, *_: object) -> list[Candidate]:
-        self.asked.append(fit.fine)
-        return [*(c for c in self.pool if c.name not in fit.names), *DUD[: len(fit.names)]]
+    def ask(self, fit: FakeFit, split, scan, most, seed, least: float, room: int, only) -> Pool:
+        shown = [c for c in self.pool if self.beside.get(c.name, set()) <= fit.names]
+        found = [c for c in shown if c.name not in fit.names and (only is None or c.name in only)]
+        asked = [c for c in found if c.evidence > least and not c.effect.per_spot][:room]
+        rivals = {n: [candidate(r) for r in names] for n, names in self.rivals.items()}
+        return Pool(found, [Taken(c, rivals.get(c.name, [])) for c in asked])
 
     def own_evidence(
-        self, fit: FakeFit, split: object, most: int, seed: int, name: str
-    ) -> tuple[float, float]:
-        assert name in fit.names
-        assert fit.fine or self.together
-        found = next(c for c in self.pool if c.name == name)
-        return self.own.get(name, found.evidence), found.lit
+        self, fit: FakeFit, split, most, seed, names: list[str]
+    ) -> dict[str, tuple[float, float]]:
+        assert set(names) <= fit.names
+        found = {c.name: c for c in self.pool}
+        return {n: (self.own.get(n, found[n].evidence), found[n].lit) for n in names}
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
         fit = FakeFit(extension, seed, anew=True)
@@ -148,36 +146,27 @@ class World:
         self.grown.append(fit.names)
         return FakeFit(fit.extension, seed, fine=True, anew=fit.anew)
 
-    def loop(self, steps: Steps | None = None, s: CriticismSettings = SETTINGS) -> Loop:
-        return Loop(self.rebuild, self.grow, SPLIT, SCAN, s, 4, steps or Steps())
+    def loop(self, s: CriticismSettings = SETTINGS) -> Loop:
+        return Loop(self.rebuild, self.grow, SPLIT, SCAN, s, 4, loop.Steps())
 
-    def turn(self) -> Turn:
-        return self.loop().turn(fitted(), fitted(fine=True))
-
-    def confirm(self, name: str) -> Turn:
-        """The pool's turn, and its term beside a fine scene."""
-        turn = self.turn()
-        assert turn.best.name == name
-        loop, fine = self.loop(), fitted(name, fine=True)
-        return loop.confirm(turn, loop.own(turn, fine), fine, fitted(fine=True))
+    def hold(self, *names: str) -> tuple[dict[str, Member], FakeFit]:
+        """Which of some terms hold, by name, and the scene that is left."""
+        found = {c.name: c for c in self.pool}
+        members, scene = self.loop().hold([Member(found[n]) for n in names], fitted(*names, fine=True))
+        assert [m.name for m in members] == list(names)
+        return {m.name: m for m in members}, scene
 
     def criticise(self, s: CriticismSettings = SETTINGS) -> Findings:
-        return turns.criticise(fitted(), self.rebuild, self.grow, SPLIT, SCAN, s, 4)
+        return criticise(fitted(), self.rebuild, self.grow, SPLIT, SCAN, s, 4)
+
+
+def nats(value: float) -> Tensor:
+    """``[120]`` of which every spot has the same share."""
+    return NOTHING + value / 120
 
 
 def trial(name: str, likelihood: Tensor) -> Trial:
     return Trial(candidate(name), None, likelihood, compare(NOTHING, likelihood, BLOCK))
-
-
-def test_a_larger_pool_needs_more():
-    """ln(terms/level): a mean Bayes factor of 1 for each. A tenth of the misfit is needed on top."""
-    pool = [candidate("irf_tail")] * 40
-    assert needed(pool, CriticismSettings(level=0.01), 0.0) == pytest.approx(math.log(4000))
-    assert needed(pool[:1], CriticismSettings(level=0.1), 0.0) == pytest.approx(math.log(10))
-    s = CriticismSettings(share=0.1)
-    assert needed(pool, s, 500.0) == pytest.approx(math.log(4000) + 50)
-    for lit, share in ((1.0, 50), (0.2, 10), (0.0, 0)):
-        assert needed(pool, s, 500.0, lit) == pytest.approx(math.log(4000) + share)
 
 
 def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
@@ -187,25 +176,6 @@ def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
         found = SimpleNamespace(deviance_per_bin=deviance, deviance_noise=0.9)
         monkeypatch.setattr(loop, "score", lambda *_, found=found: found)
         assert misfit_of(fit, np.arange(7), 3) == pytest.approx(nats)
-
-
-def test_leaders_are_the_best_of_each_kind():
-    """Half of the laws by evidence, half by what it were if the scatter were their own; one free term and one
-    with a number for each spot besides.
-    """
-    names = [
-        *("free_wall", "free_time", "irf_tail", "pile_up", "vignetting", "free_scan", "hum", "hot_spots"),
-        *("ambient_map", "timing_jitter"),
-    ]
-    found = [candidate(n, 100.0 - k) for k, n in enumerate(names)]
-
-    def names_of(number: int) -> list[str]:
-        return [c.name for c in leaders(found, number)]
-
-    assert names_of(2) == ["free_wall", "irf_tail", "pile_up", "hot_spots"]
-    assert names_of(4) == ["free_wall", "irf_tail", "pile_up", "vignetting", "hum", "hot_spots"]
-    found[8] = replace(found[8], loud=500.0)
-    assert names_of(2) == ["free_wall", "irf_tail", "hot_spots", "ambient_map"]
 
 
 def test_a_term_begins_where_the_pool_saw_it():
@@ -277,282 +247,215 @@ def test_trials_stand_by_gain_with_their_weights():
     assert [t.weight for t in found] == pytest.approx([1, 0], abs=1e-3)
 
 
-def test_nothing_is_tried_where_nothing_is_asked_for(monkeypatch):
-    bar = math.log(2 / 0.01) + SETTINGS.share * 30
+@pytest.mark.parametrize(("less", "names"), [(2.5, {"irf_tail", "pile_up"}), (3.5, {"irf_tail"})])
+def test_the_edge_of_a_group(less, names):
+    """Where all patches say the same, a weight of a twentieth is 2.94 nats."""
+    trials = [gained("irf_tail", 100.0), gained("pile_up", 100.0 - less)]
+    assert group_of(trials[0], trials, BLOCK, 0.05).keys() == names
+
+
+def names_of(members: list[Member]) -> list[str]:
+    return [m.name for m in members]
+
+
+def test_where_nothing_is_asked_for_nothing_is_tried(monkeypatch):
+    """ln(terms/level): a mean Bayes factor of 1 for each."""
     for above in (False, True):
-        pool = [candidate("irf_tail", bar + (0.01 if above else -0.01)), candidate("pile_up", 0.0)]
-        found = World(monkeypatch, {}, pool, misfit=30.0).turn()
-        assert (found.best, found.candidates, found.needed) == (None, pool, pytest.approx(bar))
-        assert [t.name for t in found.trials] == (["none", "irf_tail"] if above else [])
+        pool = [candidate("irf_tail", LEAST + (0.01 if above else -0.01)), candidate("pile_up", 0.0)]
+        found = World(monkeypatch, {"irf_tail": nats(20.0)}, pool).criticise()
+        assert names_of(found.members) == (["irf_tail"] if above else [])
+        assert (found.final is found.base) is not above
+        assert found.pools[0].candidates == pool
+        assert (found.base.names, found.base.fine) == (set(), True)
 
 
-def test_what_gains_is_chosen_and_what_gains_nothing_is_not(monkeypatch):
-    """A gain of one error leaves none open, which is the simplest; one of four does not."""
-    for errors, name in ((1.0, None), (4.0, "irf_tail")):
-        gain = gaining(errors, scatter=1.0)
-        found = World(monkeypatch, {"irf_tail": gain}, [candidate("irf_tail")]).turn()
-        assert (found.best and found.best.name) == name
-        assert sum(t.weight for t in found.trials) == pytest.approx(1)
-
-
-def test_a_gain_in_few_places_counts(monkeypatch):
-    """A glossy spot shows in one wall patch of many: its standard error over patches is as large as its gain,
-    but no draw of patches makes it a loss.
+def test_what_is_needed_is_a_tenth_of_the_misfit_besides(monkeypatch):
+    """Of the mean of fitted and select spots: what surfels take up of the noise of the first they add to that
+    of the others. 1000 nats and 900 fewer: 55.
     """
-    gain = torch.where(torch.from_numpy(BLOCK[0] == BLOCK), 20.0, 0.001).double()
-    found = World(monkeypatch, {"specular_lobe": gain}, [candidate("specular_lobe")]).turn()
-    assert found.trials[0].gain.nats < 1.5 * found.trials[0].gain.error
-    none = next(t.weight for t in found.trials if t.candidate is None)
-    assert (found.best is None) == (none > SETTINGS.open_share)
+    world = World(monkeypatch, {}, [], misfit=1000.0, taken_up=900.0)
+    assert world.loop().needed(fitted(fine=True)) == pytest.approx(LEAST + 55)
+    assert World(monkeypatch, {}, [], misfit=-10.0).loop().needed(fitted()) == LEAST
+
+
+def test_terms_come_together_and_others_after_them(monkeypatch):
+    """The pool is asked again beside those that came, until nothing more is asked for, or enough is there."""
+    pool = [candidate("irf_tail", 300.0), candidate("pile_up", 200.0), candidate("vignetting", 100.0)]
+    table = {"irf_tail": gaining(40.0), "pile_up": gaining(20.0, 1), "vignetting": gaining(10.0, 2)}
+    world = World(monkeypatch, table, pool, beside={"vignetting": {"irf_tail", "pile_up"}})
+    found = world.criticise()
+    assert names_of(found.members) == names_of(found.accepted) == ["irf_tail", "pile_up", "vignetting"]
+    built = [names for names, _ in world.rebuilt]
+    assert built[:2] == [{"irf_tail", "pile_up"}, {*table}]
+    assert built[2:] == [{*table} - {name} for name in table], "each is asked for beside a scene without it"
+    assert world.grown == [set(), {*table}], "the base, and once with all"
+    assert [len(p.together) for p in found.pools] == [2, 1, 0]
+    assert found.final.names == found.again.names == {*table}
+    assert (found.final.fine, found.again.fine) == (True, False)
+    assert found.members[0].trial.gain.nats == pytest.approx(float(table["irf_tail"].sum()))
+    found = World(monkeypatch, table, pool).criticise(CriticismSettings(processes=1, most=2))
+    assert names_of(found.members) == ["irf_tail", "pile_up"]
+
+
+def test_the_better_of_two_scenes_goes_on(monkeypatch):
+    """The one that was gone on with, or one from new seeds, where surfels that imitated the terms do not come
+    back; none where no surfel survives.
+    """
+    for new, impossible, anew in (
+        (gaining(1.0), (), True),
+        (-gaining(1.0), (), False),
+        (gaining(1.0), ("irf_tail",), False),
+    ):
+        world = World(monkeypatch, {"irf_tail": gaining(20.0), "anew": new}, [], impossible=impossible)
+        found = world.loop().joined(fitted("hum"), [candidate("irf_tail")])
+        assert world.rebuilt == [({"irf_tail", "hum"}, 4)]
+        assert (found.names, found.anew) == ({"irf_tail", "hum"}, anew)
+
+
+def test_the_scene_that_predicts_best_is_asked(monkeypatch):
+    """A scene that was refined may have taken up noise."""
+    for finer, fine in ((1.0, True), (-1.0, False)):
+        table = {"irf_tail": nats(70.0), "fine+anew+irf_tail": nats(70.0 + finer)}
+        found = World(monkeypatch, table, [candidate("irf_tail")]).criticise()
+        assert (found.final.names, found.final.fine) == ({"irf_tail"}, fine)
+
+
+@pytest.mark.parametrize(("more", "accepted"), [(0.1, True), (-0.1, False)])
+def test_a_term_alone_holds_by_its_own_evidence(monkeypatch, more, accepted):
+    """Beside a misfit of 1000 nats, a tenth of which it needs, and 20 of 100 where four fifths of it lie
+    beside the scene's light. That it explains all of 100 nats does not speak for it.
+    """
+    for lit in (1.0, 0.2):
+        bar = LEAST + 100 * lit
+        pool = [candidate("irf_tail", 200.0, lit)]
+        world = World(monkeypatch, {"irf_tail": nats(1000.0)}, pool, {"irf_tail": bar + more}, misfit=1000.0)
+        found, scene = world.hold("irf_tail")
+        assert found["irf_tail"].accepted is accepted
+        assert found["irf_tail"].confirmed.needed == pytest.approx(bar)
+        assert scene.names == ({"irf_tail"} if accepted else set())
+
+
+@pytest.mark.parametrize(("errors", "by_evidence", "by_share"), [(-0.5, 0, 0), (0.5, 1, 0), (4.0, 1, 1)])
+def test_a_term_that_is_not_missed_does_not_hold(monkeypatch, errors, by_evidence, by_share):
+    """With the evidence that it needs other spots must not contradict it. Where only they speak for it, half
+    an error leaves open that nothing is gained; four do not.
+    """
+    pool = [candidate("irf_tail"), candidate("vignetting")]
+    table = {"irf_tail": gaining(errors, scatter=1.0), "vignetting": nats(90.0)}
+    found, _ = World(monkeypatch, table, pool).hold("irf_tail")
+    assert found["irf_tail"].accepted is bool(by_evidence)
+    found, _ = World(monkeypatch, table, pool, {"irf_tail": 1.0}).hold("irf_tail", "vignetting")
+    assert found["irf_tail"].accepted is bool(by_share)
+
+
+@pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
+def test_in_company_a_term_may_hold_by_what_it_explains(monkeypatch, gain, accepted):
+    """A quarter of what 120 spots leave unexplained without it: 40 nats. Numbers of single spots may not."""
+    pool = [candidate(n) for n in ("irf_tail", "vignetting", "timing_jitter")]
+    table = {"irf_tail": nats(40.0), "vignetting": nats(gain), "timing_jitter": nats(40.0)}
+    own = {"vignetting": 1.0, "timing_jitter": 1.0}
+    found, scene = World(monkeypatch, table, pool, own, misfit=100.0).hold("irf_tail", "vignetting")
+    assert found["vignetting"].accepted is accepted
+    assert found["vignetting"].confirmed.explained == pytest.approx(gain / 40, abs=1e-6)
+    assert scene.names == {"irf_tail", *(["vignetting"] if accepted else [])}
+    found, _ = World(monkeypatch, table, pool, own, misfit=100.0).hold("irf_tail", "timing_jitter")
+    assert not found["timing_jitter"].accepted
+
+
+def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):
+    """Neither is missed beside the other; without the first the second is. A free term leaves before an
+    effect, else the one that gains less.
+    """
+    for pair, stays in ((("irf_tail", "afterpulsing"), "irf_tail"), (("free_time", "irf_tail"), "irf_tail")):
+        both = "+".join(["fine", *sorted(pair)])
+        table = {pair[0]: nats(99.0), pair[1]: nats(98.0), both: nats(97.0)}
+        found, scene = World(monkeypatch, table, [candidate(n) for n in pair]).hold(*pair)
+        assert [n for n, m in found.items() if m.accepted] == [stays]
+        assert scene.names == {stays}
+        assert len(found[stays].trials) == 2
+        gain = found[stays].confirmed.gain.nats
+        assert gain == pytest.approx(99.0 if stays == pair[0] else 98.0), (
+            "asked again when the other had left"
+        )
+
+
+@pytest.mark.parametrize(("other", "accepted"), [(69.0, True), (71.0, False)])
+def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, accepted):
+    """The scene has bent itself to the term, and cannot go on without it; one from new seeds can."""
+    table = {"irf_tail": nats(70.0), "anew": nats(other), "anew+irf_tail": nats(60.0)}
+    world = World(monkeypatch, table, [candidate("irf_tail")])
+    coarse = fitted("irf_tail", "hum")
+    (found,), scene = world.loop().hold([Member(world.pool[0])], fitted("irf_tail", fine=True), coarse)
+    assert (found.accepted, scene.names) == (accepted, {"irf_tail"} if accepted else set())
+    assert found.confirmed.gain.nats == pytest.approx(70.0 - other)
+    assert world.rebuilt == [(set(), 4)], "without hum, which is not there any more"
+
+
+def test_terms_must_predict_better_than_a_finer_scene(monkeypatch):
+    for finer, names in ((60.0, {"irf_tail"}), (80.0, set())):
+        table = {"fine": nats(finer), "irf_tail": nats(70.0), "fine+irf_tail": nats(70.0)}
+        found = World(monkeypatch, table, [candidate("irf_tail")]).criticise()
+        assert found.final.names == names
+        assert [m.accepted for m in found.members] == [bool(names)]
+        assert (found.again is None) is not names or names
+
+
+@pytest.mark.parametrize(("evidence", "named"), [(LEAST + 0.1, True), (LEAST - 0.1, False)])
+def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misfit(
+    monkeypatch, evidence, named
+):
+    pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence, 0.0)]
+    table = {"timing_jitter": gaining(20.0), "wall_reflectance": gaining(40.0, seed=1)}
+    found = World(monkeypatch, table, pool, misfit=10_000.0).criticise()
+    assert names_of(found.accepted) == (["timing_jitter"] if named else [])
+
+
+def test_what_single_spots_explain_is_asked_last(monkeypatch):
+    """An effect that stood for it leaves then; one that stays is still there."""
+    pool = [candidate("wall_reflectance"), candidate("irf_tail"), candidate("hot_spots")]
+    table = {"wall_reflectance": nats(30.0), "irf_tail": nats(30.0), "hot_spots": nats(50.0)}
+    table |= {"fine+hot_spots+irf_tail+wall_reflectance": nats(80.0)}
+    found = World(monkeypatch, table, pool).criticise()
+    assert {m.name: m.accepted for m in found.members} == {
+        "wall_reflectance": False,
+        "irf_tail": True,
+        "hot_spots": True,
+    }
+    assert found.final.names == {"irf_tail", "hot_spots"}
+    table |= {f"fine+hot_spots+{n}": nats(50.0) for n in ("irf_tail", "wall_reflectance")}
+    table["fine+hot_spots+irf_tail+wall_reflectance"] = nats(60.0)
+    found = World(monkeypatch, table, pool).criticise()
+    assert names_of(found.accepted) == ["wall_reflectance", "irf_tail"], "hot spots add nothing to these"
+    assert found.final.names == {"wall_reflectance", "irf_tail"}
 
 
 def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
     """A rival whose weight is above a twentieth; none and clear losers are not in it."""
     best = gaining(20.0)
-    near = best - per_spot(0.005, 1.0, seed=1)
-    table = {"irf_tail": best, "pile_up": near, "vignetting": best - per_spot(1.0, 0.1, seed=2)}
-    found = World(monkeypatch, table, [candidate(n) for n in table]).turn()
-    names = {"irf_tail", "pile_up"}
-    assert next(iter(found.group)) == found.best.name
-    assert found.group.keys() == names
-    assert sum(found.group.values()) == pytest.approx(1)
-    # A free term that does the same is no other name; weights are among effects, however much more it gains.
-    table = {"free_rate": best, "irf_tail": 0.95 * best, "afterpulsing": 0.95 * best}
-    found = World(monkeypatch, table, [candidate(n) for n in table]).turn()
-    assert found.group == {n: pytest.approx(0.5) for n in ("irf_tail", "afterpulsing")}
-
-
-@pytest.mark.parametrize(("nats", "names"), [(2.5, {"irf_tail", "pile_up"}), (3.5, {"irf_tail"})])
-def test_the_edge_of_a_group(nats, names):
-    """Where all patches say the same, a weight of a twentieth is 2.94 nats."""
-    trials = [gained("irf_tail", 100.0), gained("pile_up", 100.0 - nats)]
-    assert group_of(trials[0], trials, BLOCK, 0.05).keys() == names
-
-
-def test_a_term_is_confirmed_beside_a_fine_scene(monkeypatch):
-    """By its evidence there, and as long as the scene that grew without it does not predict better."""
-    tail, fine = gaining(10.0), gaining(30.0, seed=1)
-    for misfit, accepted in ((0.0, True), (1001.0, False)):
-        world = World(monkeypatch, {"irf_tail": tail}, [candidate("irf_tail", 200.0)], misfit=misfit)
-        world.own["irf_tail"] = math.log(1 / 0.01) + 100 * SETTINGS.share * 10
-        found = world.confirm("irf_tail")
-        assert found.accepted is accepted
-        assert found.confirmed.needed == pytest.approx(math.log(100) + SETTINGS.share * misfit)
-        assert found.confirmed.gain.nats == pytest.approx(float(tail.sum()))
-    for without, accepted in ((-fine, True), (fine, False)):
-        table = {"irf_tail": tail, "fine+irf_tail": NOTHING, "fine": without}
-        found = World(monkeypatch, table, [candidate("irf_tail", 200.0)]).confirm("irf_tail")
-        assert found.accepted is accepted
-
-
-def test_the_mean_of_fitted_and_other_spots_says_what_is_accepted(monkeypatch):
-    """1000 nats on select spots, and 900 fewer on fitted ones: a tenth of 100 is asked before trials, on top
-    of ln(1/level), and of 550 at the end, where noise that surfels took up counts once for and once against.
-    """
-    for evidence, accepted in ((59.5, False), (59.7, True)):
-        pool = [candidate("irf_tail", evidence)]
-        world = World(monkeypatch, {"irf_tail": gaining(20.0)}, pool, misfit=1000.0, taken_up=900.0)
-        found = world.confirm("irf_tail")
-        assert found.needed == pytest.approx(math.log(100) + 10)
-        assert found.confirmed.needed == pytest.approx(math.log(100) + 55)
-        assert found.accepted is accepted
-
-
-def test_a_term_that_stands_for_a_finer_scene_is_refused(monkeypatch):
-    """It gains as the scene is coarse, and nothing more when it is not."""
-    table = {"irf_tail": gaining(20.0)}
-    world = World(monkeypatch, table, [candidate("irf_tail", 200.0)], own={"irf_tail": 1.0})
-    found = world.criticise()
-    assert [(t.best.name, t.accepted) for t in found.turns] == [("irf_tail", False)]
-    assert world.asked == [False]
-    assert (found.accepted, found.losses, found.again) == ([], {}, None)
-    assert found.final is found.base
-    assert (found.base.names, found.base.fine) == (set(), True)
-
-
-@pytest.mark.parametrize(
-    ("evidence", "own", "names"),
-    [(12.0, 200.0, ["pile_up"]), (12.0, 1.0, []), (10.0, 200.0, [])],
-)
-def test_what_is_next_best_is_asked_in_place_of_what_is_refused(monkeypatch, evidence, own, names):
-    """If the pool asks for it: the bar is 5.3 + 5.3. A term that only its gain speaks for ends the turn."""
-    table = {"irf_tail": gaining(40.0), "pile_up": gaining(20.0, seed=1)}
-    pool = [candidate("irf_tail", 300.0), candidate("pile_up", evidence)]
-    found = World(monkeypatch, table, pool, own={"irf_tail": 1.0, "pile_up": own}, misfit=53.0)
-    turns = found.criticise().turns
-    assert [t.best.name for t in turns if t.accepted] == names
-    first = turns[0]
-    asked = evidence > first.needed
-    assert first.best.name == ("pile_up" if asked else "irf_tail")
-    assert {n: c.evidence for n, c in first.refused.items()} == ({"irf_tail": 1.0} if asked else {})
-    assert "irf_tail" not in first.group or not asked
-    assert found.grown[0] == set()
-    assert {"pile_up"} not in found.grown or asked
-
-
-@pytest.mark.parametrize(("evidence", "named"), [(5.4, True), (5.2, False)])
-def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misfit(
-    monkeypatch, evidence, named
-):
-    """ln(2/level) = 5.3, beside a misfit of 10 000 nats, of which a map would need 1000."""
-    monkeypatch.setattr(loop, "solve", lambda *_: None)
-    pool = [candidate("wall_reflectance", 150.0), candidate("timing_jitter", evidence, 0.0)]
-    table = {"timing_jitter": gaining(20.0), "wall_reflectance": gaining(40.0, seed=1)}
-    found = World(monkeypatch, table, pool, misfit=10_000.0).criticise()
-    assert [t.best.name for t in found.accepted] == (["timing_jitter"] if named else [])
-
-
-def test_the_better_of_two_scenes_goes_on(monkeypatch):
-    """The one that was gone on with, or one from new seeds, where surfels that imitated the term do not come
-    back; none where no surfel survives.
-    """
-    for new, impossible, taken in (
-        (gaining(1.0), (), True),
-        (-gaining(1.0), (), False),
-        (gaining(1.0), ("irf_tail",), False),
-    ):
-        table = {"irf_tail": gaining(20.0), "anew": new}
-        world = World(monkeypatch, table, [candidate("irf_tail", 200.0)], impossible=impossible)
-        best = world.turn().best
-        again = world.loop().again(best)
-        assert world.rebuilt == [({"irf_tail"}, 4)]
-        assert (again is not best.fit) is taken
-
-
-@pytest.mark.parametrize(("without", "accepted"), [(0.0, True), (10.0, False)])
-def test_other_seeds_are_tried_without_the_term_where_they_were_with_it(monkeypatch, without, accepted):
-    """With the term a scene that is built anew is better by ten nats when it is fine. If it is without the
-    term, too, that is no merit of the term's.
-    """
-    table = {"irf_tail": gaining(20.0), "anew": NOTHING + 0.1}
-    table |= {"fine+anew+irf_tail": NOTHING + 10 / 120, "fine+anew": NOTHING + without / 120}
-    table["fine+irf_tail"] = NOTHING
-    world = World(monkeypatch, table, [candidate("irf_tail", 200.0)])
-    turn = world.criticise().turns[0]
-    assert world.rebuilt[:2] == [({"irf_tail"}, 4), (set(), 4)]
-    assert turn.accepted is accepted
-    assert turn.confirmed.gain.nats == pytest.approx(10 if accepted else 0)
-
-
-@pytest.mark.parametrize(("evidence", "accepted"), [(200.0, True), (1.0, False)])
-def test_a_fine_scene_goes_on_with_the_term_where_two_scenes_do_not_tell(monkeypatch, evidence, accepted):
-    """The scene that was refined with the term has bad luck; that without it gains by the term. It is tried
-    where there is evidence enough, and stays.
-    """
-    gain = gaining(20.0)
-    table = {"irf_tail": gain, "anew": NOTHING + 0.1, "fine+anew": NOTHING - 1, "fine+irf_tail": gain}
-    table["fine+anew+irf_tail"] = gain - 2 * gain.mean()
-    world = World(monkeypatch, table, [candidate("irf_tail", 200.0)], own={"irf_tail": evidence})
-    found = world.criticise()
-    assert bool(found.accepted) is accepted
-    assert (found.final.names, found.final.anew) == ({"irf_tail"} if accepted else set(), False)
-
-
-def test_the_loop_takes_one_term_after_the_other(monkeypatch):
-    """Until nothing is asked for, or enough is there."""
-    pool = [candidate("irf_tail", 300.0), candidate("pile_up", 200.0), candidate("vignetting", 100.0)]
     table = {
-        "irf_tail": gaining(40.0),
-        "pile_up": gaining(20.0, seed=1),
-        "vignetting": gaining(10.0, seed=2),
+        "wall_reflectance": best,
+        "pile_up": best - per_spot(3.0, 0.1, 2),
+        "hum": best - per_spot(0.01, 1),
     }
-    world = World(monkeypatch, table, pool)
-    found = world.criticise()
-    assert [t.best and t.best.name for t in found.turns] == ["irf_tail", "pile_up", "vignetting", None]
-    assert found.final.names == {"irf_tail", "pile_up", "vignetting"}
-    assert [t.best.name for t in found.accepted] == ["irf_tail", "pile_up", "vignetting"]
-    assert list(found.losses) == [e.name for e in found.final.extension.effects]
-    assert found.losses["irf_tail"].nats == pytest.approx(float(table["irf_tail"].sum()))
-    assert (found.again.names, found.again.fine) == (found.final.names, False)
-    assert (found.base.names, found.base.fine) == (set(), True)
-    assert len(world.grown) == 4, "the base, and once for each term"
-    found = World(monkeypatch, table, pool).criticise(CriticismSettings(processes=1, most=2))
-    assert [t.best.name for t in found.turns] == ["irf_tail", "pile_up"]
+    rivals = {"wall_reflectance": ["hum", "pile_up", "crosstalk"]}
+    world = World(monkeypatch, table, [candidate("wall_reflectance")], rivals=rivals)
+    (member,) = world.criticise(replace(SETTINGS, most_of=2.0, odds=2.0)).accepted
+    assert member.group.keys() == {"wall_reflectance", "hum"}
+    assert next(iter(member.group)) == "wall_reflectance"
+    assert sum(member.group.values()) == pytest.approx(1)
+    assert {t.name for t in member.trials} == {"wall_reflectance", "hum", "pile_up", "none"}, "two rivals"
 
 
-def test_a_loop_that_finds_nothing(monkeypatch):
-    found = World(monkeypatch, {}, [candidate("irf_tail", 0.0)]).criticise()
-    assert isinstance(found, Findings)
-    assert (found.accepted, found.again, len(found.turns), found.losses) == ([], None, 1, {})
-    assert found.base is found.final
-
-
-def nats(value: float) -> Tensor:
-    """``[120]`` of which every spot has the same share."""
-    return NOTHING + value / 120
-
-
-def hidden(monkeypatch, gains: dict[str, float], misfit: float = 100.0, **own: float) -> World:
-    """A world whose terms have next to no evidence of their own beside any scene, but for those named."""
-    pool = [candidate(name, 1e6) for name in gains]
-    table = {name: nats(value) for name, value in gains.items()}
-    return World(monkeypatch, table, pool, dict.fromkeys(gains, 1.0) | own, misfit=misfit, together=True)
-
-
-@pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
-def test_terms_that_are_refused_alone_are_asked_for_in_company(monkeypatch, gain, accepted):
-    """Each explains a quarter of what 120 spots leave unexplained without it: 40 nats."""
-    world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": gain})
-    found = world.criticise()
-    names = {"irf_tail", "vignetting"} if accepted else {"irf_tail"}
-    assert {t.best.name for t in found.accepted} == found.final.names == names
-    assert found.losses.keys() == names
-    if accepted:
-        assert [(t.confirmed.evidence, t.confirmed.gain.nats) for t in found.accepted] == [
-            (1.0, pytest.approx(40.0)),
-            (1.0, pytest.approx(gain)),
-        ]
-        assert [t.refused for t in found.accepted] == [{}, {}]
-
-
-def test_where_no_term_comes_to_the_first_there_is_no_company(monkeypatch):
-    found = hidden(monkeypatch, {"irf_tail": 40.0}).criticise()
-    assert [(t.best.name, t.accepted) for t in found.turns] == [("irf_tail", False)]
-
-
-def test_who_does_not_hold_leaves_the_company(monkeypatch):
-    nothing = hidden(monkeypatch, {"irf_tail": 9.0, "vignetting": 8.0}).criticise()
-    assert (nothing.accepted, nothing.final) == ([], nothing.base)
-    world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0, "pile_up": 5.0})
-    found = world.criticise()
-    assert found.final.names == found.again.names == {"irf_tail", "vignetting"}
-    assert {"irf_tail", "vignetting", "pile_up"} in world.grown
-
-
-@pytest.mark.parametrize(("evidence", "held"), [(14.8, True), (14.6, False)])
-def test_evidence_holds_in_company_too(monkeypatch, evidence, held):
-    """ln(1/level) = 4.6 and a tenth of 100; what is gained is less than a quarter of the misfit."""
-    world = hidden(monkeypatch, {"irf_tail": 5.0}, irf_tail=evidence)
-    turn = world.turn()
-    ((found, without),) = world.loop().held([turn], fitted("irf_tail", fine=True))
-    assert (found.accepted, without.names) == (held, set())
-
-
-def test_a_company_must_predict_better_than_a_finer_scene(monkeypatch):
-    for finer, names in ((60.0, {"irf_tail", "vignetting"}), (80.0, set())):
-        world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0})
-        world.table |= {"fine": nats(finer), "fine+irf_tail+vignetting": nats(70.0)}
-        world.table |= {"fine+irf_tail": nats(40.0), "fine+vignetting": nats(30.0)}
-        assert world.criticise().final.names == names
-
-
-def test_the_company_keeps_the_scene_that_predicts_best(monkeypatch):
-    """A scene that was refined may have taken up noise."""
-    for finer, fine in ((1.0, True), (-1.0, False)):
-        world = hidden(monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0})
-        world.table |= {"fine": nats(0.0), "fine+irf_tail+vignetting": nats(70.0 + finer)}
-        world.table |= {"fine+irf_tail": nats(40.0), "fine+vignetting": nats(30.0)}
-        assert world.criticise().final.fine is fine
-
-
-def test_numbers_of_single_spots_are_no_company(monkeypatch):
-    """They are asked for by themselves, after it."""
-    monkeypatch.setattr(loop, "solve", lambda *_: None)
-    world = hidden(monkeypatch, {"irf_tail": 40.0, "timing_jitter": 30.0}, timing_jitter=500.0)
-    found = world.criticise()
-    assert [t.best.name for t in found.accepted] == ["timing_jitter"]
-    both = hidden(
-        monkeypatch, {"irf_tail": 40.0, "vignetting": 30.0, "timing_jitter": 20.0}, timing_jitter=500.0
+def test_a_simpler_rival_takes_the_place_of_a_term(monkeypatch):
+    """Where it gains as much; the others stay as they are."""
+    table = {"wall_reflectance": nats(50.0), "vignetting": nats(49.0), "irf_tail": nats(60.0)}
+    pool, rivals = (
+        [candidate("irf_tail"), candidate("wall_reflectance")],
+        {"wall_reflectance": ["vignetting"]},
     )
-    found = both.criticise()
-    assert [t.best.name for t in found.accepted] == ["irf_tail", "vignetting", "timing_jitter"]
+    found = World(monkeypatch, table, pool, rivals=rivals).criticise()
+    assert names_of(found.accepted) == ["irf_tail", "vignetting"]
+    assert found.final.names == {"irf_tail", "vignetting"}
+    member = found.members[1]
+    assert (member.trial.name, member.trial.gain.nats) == ("vignetting", pytest.approx(49.0))
+    assert list(member.group) == ["vignetting", "wall_reflectance"]

@@ -21,6 +21,7 @@ from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.per_spot import neighbours
+from nlos_lit.inference.pool import Pool
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
 from nlos_lit.inference.witness import direct_decays, direct_delays, log_gain, over_neighbours, witness
@@ -66,7 +67,7 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
 
     def ask(fit, split, scan, most, seed):
         asked.append((most, seed))
-        return [candidate("irf_tail", 3.0 + seed), candidate("hum", 1.0)]
+        return Pool([candidate("irf_tail", 3.0 + seed), candidate("hum", 1.0)], [])
 
     monkeypatch.setattr(toys, "ask", ask)
     scene = capture_of(raster(8))
