@@ -135,7 +135,7 @@ def diagnose_first(config: DictConfig, settings: dict[str, Any], folder: Path) -
                 folder=folder / "diagnosis",
                 settings=json.dumps(kept, indent=1, default=str),
                 report=ticker.step,
-                told=watched.turn,
+                told=watched.told,
             )
     except KeyboardInterrupt:
         mark_interrupted(folder / "diagnosis")

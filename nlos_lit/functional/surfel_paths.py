@@ -258,13 +258,15 @@ def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
         >>> scatter_bins(torch.tensor([[[1.0, 4.0, 1.0, 0.0]]]), torch.tensor([[-1]]), n_bins=3)
         tensor([[4., 1., 0.]])
     """
-    bins = first.reshape(len(first), -1)[..., None] + torch.arange(4, device=first.device)
-    values = values.reshape(bins.shape)
-    inside = (bins >= 0) & (bins < n_bins)
-    row = torch.arange(len(first), device=first.device)[:, None, None] * n_bins
-    flat = torch.zeros(len(first) * n_bins, dtype=values.dtype, device=values.device)
-    flat = flat.index_add(0, (bins.clamp(0, n_bins - 1) + row).reshape(-1), (values * inside).reshape(-1))
-    return flat.view(len(first), n_bins)
+    first = first.reshape(len(first), -1).clamp(-4, n_bins)
+    values = values.reshape(*first.shape, 4)
+    width = n_bins + 8  # four bins on either side take what is lost
+    row = torch.arange(len(first), device=first.device)[:, None] * width
+    start = (first + 4 + row).reshape(-1)
+    flat = torch.zeros(len(first) * width, dtype=values.dtype, device=values.device)
+    for k in range(4):
+        flat = flat.index_add(0, start + k, values[..., k].reshape(-1))
+    return flat.view(len(first), width)[:, 4 : 4 + n_bins].contiguous()
 
 
 def gather_bins(image: Tensor, time: Tensor) -> Tensor:

@@ -102,7 +102,7 @@ def assemble(
         chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
         if null is None
         else null.chance(largest),
-        notes=[],
+        notes=[_told(m) for m in found.members if not m.accepted and m.predicts],
         capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
@@ -151,6 +151,18 @@ def _accepted(
         needed=confirmed.needed,
         explained=confirmed.explained,
         tried={name: _tried(name, member.trials, split) for name in weights},
+    )
+
+
+def _told(member: Member) -> str:
+    """That a term is not named although other spots are predicted better with it."""
+    found = member.confirmed
+    assert found is not None  # what makes it predict anything
+    return (
+        f"{member.name} was tried and is not named. With it spots that were not fitted are predicted better, "
+        f"by {found.gain.nats:.0f} ± {found.gain.error:.0f} nats, {100 * found.explained:.0f} % of what they "
+        f"leave unexplained without it. But its own evidence is {found.evidence:.0f} nats, and what the scene "
+        f"leaves unexplained may look like it by {found.needed:.0f}."
     )
 
 

@@ -25,7 +25,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, Pool, ask, own_evidence
+from nlos_lit.inference.pool import MOST, Candidate, Pool, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -35,7 +35,8 @@ log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
-PREDICTED = 0.25  # of what select spots leave unexplained without a term: who explains that much is believed
+MUCH = 0.25  # of what select spots leave unexplained without a term: if it explains more, that is told …
+SURE = 0.95  # … where it has this weight
 EVEN = 0.5  # weight from which on a scene predicts better rather than worse than another
 WARM = 120  # batches, and as many again at falling rate
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
@@ -55,8 +56,7 @@ class CriticismSettings:
         rivals: look-alikes that are tried in the place of each term that holds, at most.
         open_share: weight above which the capture leaves something open: that a term is not missed; or that
             its rival is meant.
-        most_of: share of the best gain from which on a simpler rival goes before that with the best …
-        odds: … as it does if its weight is this much of the best's.
+        odds: share of the best one's weight from which on a simpler rival goes before it.
         toys: simulated captures for the null distribution.
         processes: that work on them; fits that go on side by side.
     """
@@ -67,7 +67,6 @@ class CriticismSettings:
     most: int = 8
     rivals: int = 2
     open_share: float = 0.05
-    most_of: float = 0.9
     odds: float = 0.25
     toys: int = 0
     processes: int = 2
@@ -116,7 +115,7 @@ class Confirmed:
     explained: float = 0.0
 
     @property
-    def asked_for(self) -> bool:
+    def holds(self) -> bool:
         """By its own evidence, which other spots do not contradict."""
         return self.evidence > self.needed and self.weight > EVEN
 
@@ -149,6 +148,11 @@ class Member:
     @property
     def free(self) -> bool:
         return self.name in FREE_NAMES
+
+    @property
+    def predicts(self) -> bool:
+        """With it spots that were not fitted are predicted much better: that is told, if no more."""
+        return self.confirmed is not None and self.confirmed.explained > MUCH and self.confirmed.weight > SURE
 
     @property
     def trial(self) -> Trial:
@@ -429,7 +433,7 @@ class Loop:
             now = replace(
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
-            found.append(replace(member, confirmed=now, accepted=self._holds(member, now, len(members))))
+            found.append(replace(member, confirmed=now, accepted=now.holds))
         return found
 
     def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
@@ -444,11 +448,6 @@ class Loop:
         gain = compare(before, value, self.block)
         explained = gain.nats / max(misfit_of(without, select, len(select)), gain.nats, 1e-9)
         return gain, weights([before, value], self.block)[1], explained
-
-    def _holds(self, member: Member, found: Confirmed, number: int) -> bool:
-        """By its own evidence, or among others by what it explains."""
-        share = number > 1 and not _of_spots(member) and found.explained > PREDICTED
-        return found.asked_for or (share and found.weight > 1 - self.settings.open_share)
 
     def _asked(self, members: list[Member], scene: SurfelFit) -> list[tuple[Member, SurfelFit]]:
         """Each of some terms, asked beside the others, and the scene gone on without it."""
@@ -470,8 +469,8 @@ class Loop:
             before = log_likelihood(fit, select)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
-            holds = self._holds(member, confirmed, len(members))
-            found.append((replace(member, confirmed=confirmed, accepted=holds, trials=trials), fit))
+            asked = replace(member, confirmed=confirmed, accepted=confirmed.holds, trials=trials)
+            found.append((asked, fit))
         return found
 
     def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
@@ -559,7 +558,7 @@ class Loop:
             value = log_likelihood(fit, self.split.select)
             trials.append(Trial(c, fit, value, compare(none.likelihood, value, self.block)))
         trials = weighed(trials, self.block)
-        best = chosen(trials, s) or itself
+        best = chosen(trials, s.odds)
         assert best.candidate is not None
         group = group_of(best, trials, self.block, s.open_share)
         return replace(member, candidate=best.candidate, trials=trials, group=group)
@@ -652,7 +651,7 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     """Trials with their weights, the largest gain first.
 
     Args:
-        trials: of one turn.
+        trials: in one place.
         block: ``[S]`` wall block of each select spot.
 
     Returns:
@@ -663,24 +662,19 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     return sorted(found, key=lambda t: -t.gain.nats)
 
 
-def chosen(trials: list[Trial], s: CriticismSettings) -> Trial | None:
+def chosen(trials: list[Trial], odds: float) -> Trial:
     """The simplest of those that gain most.
 
     Args:
-        trials: of one turn, with weights, the largest gain first.
-        s: settings.
+        trials: in one place, with weights, the largest gain first; none is not chosen.
+        odds: share of the best one's weight from which on a simpler one goes before it, as it does from
+            ``MOST`` of its gain on.
 
     Returns:
-        None where going on with none is open. Else, of all terms with most of the best one's gain or much of
-        its weight, an effect before a free term and few coefficients before many; what it leaves is asked for
-        in the next turn.
+        an effect before a free term, few coefficients before many.
     """
     first, *others = [t for t in trials if t.candidate is not None]
-    if any(t.candidate is None and t.weight > s.open_share for t in trials):
-        return None
-    near = [
-        t for t in others if t.gain.nats >= s.most_of * first.gain.nats or t.weight >= s.odds * first.weight
-    ]
+    near = [t for t in others if t.gain.nats >= MOST * first.gain.nats or t.weight >= odds * first.weight]
     return min([first, *near], key=cost)
 
 
@@ -694,8 +688,8 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) 
     """What the capture cannot tell from the best, among those of its kind: effects, or free terms.
 
     Args:
-        best: of the turn.
-        trials: of the turn.
+        best: in its place.
+        trials: there.
         block: ``[S]`` wall block of each select spot.
         least: weight above which it cannot.
 
@@ -706,10 +700,6 @@ def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) 
     shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
     left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
     return {name: weight / sum(left.values()) for name, weight in left.items()}
-
-
-def _of_spots(member: Member) -> bool:
-    return member.candidate.effect.per_spot
 
 
 def _gain(member: Member) -> float:

@@ -29,7 +29,7 @@ from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.fit import SurfelFit
 
-MOST = 0.9  # of the largest evidence: terms with so much may be taken if they are simpler
+MOST = 0.9  # of the largest evidence or gain: a simpler term with so much goes before that with the largest
 KEPT = 16  # shapes of one effect that are tested in full; the others are worth nothing beside them
 TOGETHER = 128  # columns from which on no more effects are projected along
 WORK = 5e10  # multiplications of the nuisance columns with each other, some 1 s of one core

@@ -113,8 +113,7 @@ class Accepted:
         tried: the names of ``weights`` as they were tried, each beside the same scene.
         advised: nats that captures as long as this one are expected to tell between the term and the rival
             that is hardest to tell from it, by what is done in them, see :mod:`nlos_lit.inference.advise`.
-        explained: share that it explains of what held-out spots leave unexplained without it; 0 where that
-            was not asked.
+        explained: share that it explains of what held-out spots leave unexplained without it.
     """
 
     name: str
@@ -130,11 +129,6 @@ class Accepted:
     tried: dict[str, Tried] = field(default_factory=dict)
     advised: dict[str, float] = field(default_factory=dict)
     explained: float = 0.0
-
-    @property
-    def asked_for(self) -> bool:
-        """The counts themselves ask for it; else other spots do, by what it explains of them."""
-        return self.needed is None or not self.evidence < self.needed
 
     @property
     def confusable_with(self) -> list[str]:

@@ -64,8 +64,6 @@ def confidence(diagnosis: Diagnosis) -> str:
     it = "each of them" if several else "it"
     held = all(term.heldout_gain.ci95[0] > 0 for term in terms)
     asked = f"the counts ask for {it} by more than is needed"
-    if not all(term.asked_for for term in terms):
-        asked += ", or it explains much of what is wrong elsewhere on the wall"
     if any(rivals(diagnosis, term) for term in terms):
         first = "Open: that something is there is " + ("well supported" if held else "likely")
         text = f"{first}, but what it is this capture cannot tell: more than one cause would look like this."

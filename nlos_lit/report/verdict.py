@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from nlos_lit.inference.result import Accepted, Diagnosis, Scores, Screened
 from nlos_lit.report.quantities import headline, number, percent, probability
-from nlos_lit.report.words import AXES, capital, describe
+from nlos_lit.report.words import AXES, describe
 
 AT_NOISE = 0.03  # excess over counting noise that is called "at the noise"
 BARELY = 0.05  # retained information below which the scene can imitate nearly all of an effect
@@ -231,32 +231,19 @@ def _held(diagnosis: Diagnosis) -> float | None:
 def _evidence(diagnosis: Diagnosis, terms: list[Accepted]) -> str:
     """How much the counts ask for what was found, or for what comes nearest to being found."""
     needed = f"{number(diagnosis.needed)} are needed"
-    others = "".join(f" {_explains(term)}" for term in terms if not term.asked_for)
-    asked_for = [term for term in terms if term.asked_for]
-    found = [term.evidence for term in asked_for if math.isfinite(term.evidence)]
+    found = [term.evidence for term in terms if math.isfinite(term.evidence)]
     if found:
-        it = "each of them" if len(asked_for) == len(terms) else "each other"
-        least = f"{it} is at least" if len(asked_for) > 1 else "it is" if len(terms) == 1 else "the other is"
-        bars = [diagnosis.needed if term.needed is None else term.needed for term in asked_for]
+        least = "each of them is at least" if len(terms) > 1 else "it is"
+        bars = [diagnosis.needed if term.needed is None else term.needed for term in terms]
         low, high = number(min(bars)), number(max(bars))
         asked = low if low == high else f"{low} – {high}"
-        return f"{others} The evidence for {least} {number(min(found))} nats; {asked} are needed.".lstrip()
-    if others:
-        return others.lstrip()
+        return f"The evidence for {least} {number(min(found))} nats; {asked} are needed."
     pool = [s for s in diagnosis.screened if math.isfinite(s.evidence)]
     if terms or not pool:
         return ""
     most = max(pool, key=lambda s: s.evidence)
     text = f"The most evidence, {number(most.evidence)} nats, is for {describe(most.name).phrase}; {needed}"
     return f"{text}, but other spots did not confirm it." if most.evidence > diagnosis.needed else f"{text}."
-
-
-def _explains(term: Accepted) -> str:
-    """Of a term that other spots ask for."""
-    phrase, share = describe(term.name).phrase, percent(term.explained)
-    return (
-        f"{capital(phrase)} explains {share} of what spots that were not fitted leave unexplained without it."
-    )
 
 
 def _chance(diagnosis: Diagnosis) -> str:

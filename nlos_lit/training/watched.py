@@ -40,7 +40,7 @@ class WatchedDiagnosis:
         facts = facts_of(self.scene, self.capture, "running", ["Diagnosis: fitting the simulation first."])
         keep(self.folder, view_of(self.capture, {}, Scene(), facts))
 
-    def turn(
+    def told(
         self, image: tuple[Tensor, VolumeGrid], base: SurfelFit, present: SurfelFit, members: Sequence[Member]
     ) -> None:
         """Show what was found so far.

@@ -34,11 +34,6 @@ def test_confidence_is_said_in_words():
     assert "criticism.toys=20" in confidence(dataclasses.replace(alone, toys=0))
     assert "criticism.toys" not in confidence(dataclasses.replace(alone, toys=20))
     assert "σ" not in confidence(alone)
-    told = dataclasses.replace(TILT, needed=1200.0, explained=0.36)
-    both = confidence(two_found(effects=[TAIL_ALONE, told], groups=[]))
-    assert both.startswith(
-        "Good: the counts ask for each of them by more than is needed, or it explains much of"
-    )
 
 
 def test_what_to_do_next_depends_on_what_was_found():
