@@ -17,9 +17,10 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
 from nlos_lit.inference.advise import expected_nats
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Member, Trial
+from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.distil import Follower, laid_through
 from nlos_lit.inference.heldout import Comparison, by_block, score
+from nlos_lit.inference.members import Findings, Member, Trial
 from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.result import (
@@ -161,8 +162,8 @@ def _told(member: Member) -> str:
     return (
         f"{member.name} was tried and is not named. With it spots that were not fitted are predicted better, "
         f"by {found.gain.nats:.0f} ± {found.gain.error:.0f} nats, {100 * found.explained:.0f} % of what they "
-        f"leave unexplained without it. But its own evidence is {found.evidence:.0f} nats, and what the scene "
-        f"leaves unexplained may look like it by {found.needed:.0f}."
+        f"leave unexplained without it. But its own evidence is {found.evidence:.0f} nats, and what the "
+        f"scene leaves unexplained may look like it by {found.needed:.0f}."
     )
 
 

@@ -10,7 +10,7 @@ import copy
 import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -22,10 +22,11 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, FREE_NAMES
+from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
+from nlos_lit.inference.members import EVEN, Confirmed, Findings, Member, Trial, chosen, group_of, weighed
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import MOST, Candidate, Pool, ask, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -35,9 +36,6 @@ log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
-MUCH = 0.25  # of what select spots leave unexplained without a term: if it explains more, that is told …
-SURE = 0.95  # … where it has this weight
-EVEN = 0.5  # weight from which on a scene predicts better rather than worse than another
 WARM = 120  # batches, and as many again at falling rate
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 
@@ -70,121 +68,6 @@ class CriticismSettings:
     odds: float = 0.25
     toys: int = 0
     processes: int = 2
-
-
-@dataclass(frozen=True)
-class Trial:
-    """The scene with one term in a place, or with none there.
-
-    Args:
-        candidate: the term; None for none.
-        fit: the scene with it.
-        likelihood: ``[S]`` of the select spots, nats.
-        gain: over none.
-        weight: how far the capture leaves open that this is the best in that place.
-    """
-
-    candidate: Candidate | None
-    fit: SurfelFit
-    likelihood: Tensor = field(repr=False)
-    gain: Comparison
-    weight: float = 0.0
-
-    @property
-    def name(self) -> str:
-        return "none" if self.candidate is None else self.candidate.name
-
-
-@dataclass(frozen=True)
-class Confirmed:
-    """What a term is worth beside all others.
-
-    Args:
-        evidence: its own, nats.
-        needed: nats.
-        gain: of the select spots over the scene without it: gone on with, or built anew, whichever leaves it
-            less.
-        weight: how far the capture leaves open that it predicts better than that one.
-        explained: share of what the select spots leave unexplained without it.
-    """
-
-    evidence: float
-    needed: float
-    gain: Comparison
-    weight: float
-    explained: float = 0.0
-
-    @property
-    def holds(self) -> bool:
-        """By its own evidence, which other spots do not contradict."""
-        return self.evidence > self.needed and self.weight > EVEN
-
-
-@dataclass(frozen=True)
-class Member:
-    """A term that was tried together with others.
-
-    Args:
-        candidate: as the pool saw it.
-        rivals: that might be meant, as the pool saw them.
-        confirmed: what was found when it was last asked whether it holds.
-        accepted: it held.
-        trials: what was tried in its place once it held, the largest gain first: itself, rivals, none.
-        group: it and what the capture cannot tell from it, by name, with weights. A free term is none for an
-            effect.
-    """
-
-    candidate: Candidate
-    rivals: Sequence[Candidate] = ()
-    confirmed: Confirmed | None = None
-    accepted: bool = False
-    trials: list[Trial] = field(default_factory=list)
-    group: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        return self.candidate.name
-
-    @property
-    def free(self) -> bool:
-        return self.name in FREE_NAMES
-
-    @property
-    def predicts(self) -> bool:
-        """With it spots that were not fitted are predicted much better: that is told, if no more."""
-        return self.confirmed is not None and self.confirmed.explained > MUCH and self.confirmed.weight > SURE
-
-    @property
-    def trial(self) -> Trial:
-        """With its term, once it held."""
-        return next(t for t in self.trials if t.name == self.name)
-
-
-@dataclass
-class Findings:
-    """What the loop leaves behind.
-
-    Args:
-        base: the fine fit without effects.
-        final: the fit with all terms that hold.
-        pools: what was asked for, beside the base and whenever terms had come to it.
-        members: terms that were tried, in the order in which they came.
-        needed: nats of own evidence that a term needs beside the base, if it acts where the scene's light
-            falls.
-        again: the parsimonious fit with the terms that hold; None where there is none.
-    """
-
-    base: SurfelFit
-    final: SurfelFit
-    needed: float
-    pools: list[Pool] = field(default_factory=list)
-    members: list[Member] = field(default_factory=list)
-    again: SurfelFit | None = None
-
-    @property
-    def accepted(self) -> list[Member]:
-        """Terms that hold."""
-        return [m for m in self.members if m.accepted]
 
 
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
@@ -645,61 +528,6 @@ def criticise(
         found.members = [replace(m, accepted=False) for m in found.members]
     told(first, found.final, found.members)
     return found
-
-
-def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
-    """Trials with their weights, the largest gain first.
-
-    Args:
-        trials: in one place.
-        block: ``[S]`` wall block of each select spot.
-
-    Returns:
-        the same trials.
-    """
-    shares = weights([t.likelihood for t in trials], block)
-    found = [replace(t, weight=w) for t, w in zip(trials, shares, strict=True)]
-    return sorted(found, key=lambda t: -t.gain.nats)
-
-
-def chosen(trials: list[Trial], odds: float) -> Trial:
-    """The simplest of those that gain most.
-
-    Args:
-        trials: in one place, with weights, the largest gain first; none is not chosen.
-        odds: share of the best one's weight from which on a simpler one goes before it, as it does from
-            ``MOST`` of its gain on.
-
-    Returns:
-        an effect before a free term, few coefficients before many.
-    """
-    first, *others = [t for t in trials if t.candidate is not None]
-    near = [t for t in others if t.gain.nats >= MOST * first.gain.nats or t.weight >= odds * first.weight]
-    return min([first, *near], key=cost)
-
-
-def cost(trial: Trial) -> tuple[bool, int, float]:
-    """Sort key of a term: an effect before a free term, fewer coefficients before more, more gain first."""
-    assert trial.candidate is not None
-    return trial.name in FREE_NAMES, len(trial.candidate.step), -trial.gain.nats
-
-
-def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) -> dict[str, float]:
-    """What the capture cannot tell from the best, among those of its kind: effects, or free terms.
-
-    Args:
-        best: in its place.
-        trials: there.
-        block: ``[S]`` wall block of each select spot.
-        least: weight above which it cannot.
-
-    Returns:
-        weights by name, the best's first.
-    """
-    kind = [t for t in trials if t.candidate and (t.name in FREE_NAMES) == (best.name in FREE_NAMES)]
-    shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
-    left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
-    return {name: weight / sum(left.values()) for name, weight in left.items()}
 
 
 def _gain(member: Member) -> float:

@@ -16,9 +16,10 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Findings, Loop, Member, criticise
+from nlos_lit.inference.criticise import CriticismSettings, Loop, criticise
 from nlos_lit.inference.distil import distil
 from nlos_lit.inference.kept import kinds
+from nlos_lit.inference.members import Findings, Member
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.inference.split import Split, split_spots

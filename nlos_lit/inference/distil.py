@@ -18,8 +18,9 @@ from torch import Tensor
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import Formula, formulas_of
 from nlos_lit.effects.free_terms import Free
-from nlos_lit.inference.criticise import Findings, Loop, copy_effects, go_on
+from nlos_lit.inference.criticise import Loop, copy_effects, go_on
 from nlos_lit.inference.heldout import log_likelihood
+from nlos_lit.inference.members import Findings
 from nlos_lit.surfels.fit import SurfelFit
 
 TRIED = 3  # formulas with which the scene goes on

@@ -110,7 +110,7 @@ class Projector:
         values, self.axes = torch.linalg.eigh((self.uneven.T @ self.uneven).double())
         self.values = values.clamp_min(0.0)
         self.variances = torch.from_numpy(UNEVENNESS**2)
-        self.asked = self._along(self.left)[:, 0]
+        self.asked = self.along(self.left)[:, 0]
         levels = log_factor(self.values, self.asked**2, self.variances)
         self.width = int(levels.argmax())
         self.levels = levels - levels[self.width]
@@ -136,19 +136,20 @@ class Projector:
         weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
         return torch.cat([columns - self.nuisance @ weights, -self.strength * weights[self.held]])
 
-    def even(self, z: Tensor, width: int) -> Tensor:
+    def even(self, z: Tensor, width: int, across: Tensor | None = None) -> Tensor:
         """Without what patches do that look uneven.
 
         Args:
             z: ``[N + H, k]`` :meth:`free` columns.
             width: how uneven, an index of ``UNEVENNESS``.
+            across: ``[Q, k]`` :meth:`along` of z, where it is known.
 
         Returns:
             ``[N + H + Q, k]``.
         """
         variance = self.variances[width]
         shrink = variance / (1 + variance * self.values)
-        weights = (self.axes @ (shrink[:, None] * self._along(z))).float()
+        weights = (self.axes @ (shrink[:, None] * (self.along(z) if across is None else across))).float()
         return torch.cat([z - self.uneven @ weights, -weights / variance.sqrt().float()])
 
     def off(self, columns: Tensor) -> Tensor:
@@ -161,17 +162,18 @@ class Projector:
             self.residuals[width] = self.even(self.left, width)[:, 0]
         return self.residuals[width]
 
-    def width_beside(self, z: Tensor, deviation: Tensor) -> int:
+    def width_beside(self, z: Tensor, across: Tensor, deviation: Tensor) -> int:
         """How uneven patches look beside a term.
 
         Args:
             z: ``[N + H, k]`` :meth:`free` columns of the term.
+            across: ``[Q, k]`` :meth:`along` of z.
             deviation: ``[k]`` C^½.
 
         Returns:
             which of ``UNEVENNESS`` the counts ask for.
         """
-        across, scale = self._along(z) * deviation, torch.outer(deviation, deviation)
+        across, scale = across * deviation, torch.outer(deviation, deviation)
         shrink = self.variances[:, None] / (1 + self.variances[:, None] * self.values)
         information = (z.T @ z).double() * scale - torch.einsum("qk,vq,ql->vkl", across, shrink, across)
         score = (z.T @ self.left)[:, 0].double() * deviation - (shrink * self.asked) @ across
@@ -181,8 +183,8 @@ class Projector:
         nats = log_factor(values, squares, torch.from_numpy(VARIANCES)).amax(1)
         return int((self.levels + nats).argmax())
 
-    def _along(self, z: Tensor) -> Tensor:
-        """Scores of the uneven columns' eigenvectors ``[Q, k]``."""
+    def along(self, z: Tensor) -> Tensor:
+        """Scores ``[Q, k]`` of the uneven columns' eigenvectors, of ``[N + H, k]`` :meth:`free` columns."""
         return self.axes.T @ (self.uneven.T @ z).double()
 
 
@@ -338,9 +340,9 @@ def best_evidence(
     Returns:
         what the counts say of it, at the width where they say most.
     """
-    found = []
-    for width in sorted({projector.width, projector.width_beside(z, deviation)}):
-        off, level = projector.even(z, width), float(projector.levels[width])
+    found, across = [], projector.along(z)
+    for width in sorted({projector.width, projector.width_beside(z, across, deviation)}):
+        off, level = projector.even(z, width, across), float(projector.levels[width])
         one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds)
         found.append((replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)), off))
     best, off = max(found, key=lambda pair: pair[0].nats)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nlos_lit.inference.advise import AGAIN
-from nlos_lit.inference.criticise import Member
+from nlos_lit.inference.members import Member
 from nlos_lit.inference.result import Accepted, Diagnosis
 from nlos_lit.report.quantities import number, percent
 from nlos_lit.report.verdict import at_noise, excess_share, follows, invisible, rivals

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.volume_grid import VolumeGrid
-from nlos_lit.inference.criticise import Findings, Member
+from nlos_lit.inference.members import Findings, Member
 from nlos_lit.inference.result import Diagnosis
 from nlos_lit.io.files import plain
 from nlos_lit.io.views import read_view

@@ -19,7 +19,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import pool
 from nlos_lit.inference.advise import plans
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
-from nlos_lit.inference.criticise import Confirmed, CriticismSettings, Findings, Member, Trial
+from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.evidence import (
     UNEVENNESS,
     Projector,
@@ -28,6 +28,7 @@ from nlos_lit.inference.evidence import (
     step_bounds,
 )
 from nlos_lit.inference.heldout import Comparison
+from nlos_lit.inference.members import Confirmed, Findings, Member, Trial
 from nlos_lit.inference.pool import Candidate, Pool, own_evidence
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.residuals import SIDE

@@ -283,7 +283,11 @@ def test_a_term_is_held_against_a_scene_that_is_as_uneven_without_it(monkeypatch
     width, _ = max(both, key=lambda at: both[at])
     assert found.nats == pytest.approx(max(both.values()) - alone, abs=0.1)
     assert found.nats > 10
-    assert projector.width_beside(projector.free(z), unit) == width < projector.width
+    assert (
+        projector.width_beside(projector.free(z), projector.along(projector.free(z)), unit)
+        == width
+        < projector.width
+    )
 
 
 def test_patches_that_differ_leave_no_evidence_for_what_they_share():

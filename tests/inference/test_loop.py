@@ -18,21 +18,17 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference import criticise as loop
+from nlos_lit.inference import members
 from nlos_lit.inference.criticise import (
     CriticismSettings,
-    Findings,
     Loop,
-    Member,
-    Trial,
     begun_with,
-    chosen,
     copy_effects,
     criticise,
-    group_of,
     misfit_of,
-    weighed,
 )
 from nlos_lit.inference.heldout import compare
+from nlos_lit.inference.members import Findings, Member, Trial, chosen, group_of, weighed
 from nlos_lit.inference.pool import Candidate, Pool, Taken
 
 SCAN = Scan.of(capture_of(scattered(12)))
@@ -424,7 +420,7 @@ def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
     }
     rivals = {"wall_reflectance": ["hum", "pile_up", "crosstalk"]}
     world = World(monkeypatch, table, [candidate("wall_reflectance")], rivals=rivals)
-    monkeypatch.setattr(loop, "MOST", 2.0)
+    monkeypatch.setattr(members, "MOST", 2.0)
     (member,) = world.criticise(replace(SETTINGS, odds=2.0)).accepted
     assert member.group.keys() == {"wall_reflectance", "hum"}
     assert next(iter(member.group)) == "wall_reflectance"
