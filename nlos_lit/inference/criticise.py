@@ -382,7 +382,15 @@ class Loop:
             members, scene = [now.get(m.name, m) for m in members] + staying[-1:], with_it
 
     def predicts(self, scene: SurfelFit, other: SurfelFit) -> bool:
-        """Whether a scene predicts the select spots rather better than another."""
+        """Which of two scenes predicts the select spots better.
+
+        Args:
+            scene: one.
+            other: another.
+
+        Returns:
+            Whether it is the first, in more than half of the draws of wall blocks.
+        """
         values = [log_likelihood(fit, self.split.select) for fit in (other, scene)]
         return weights(values, self.block)[1] > EVEN
 
@@ -404,7 +412,15 @@ class Loop:
         return settled, scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
-        """The same scene, gone on without all other terms, where it has any."""
+        """The same scene, gone on without all other terms.
+
+        Args:
+            fit: that is copied.
+            names: of the terms that stay.
+
+        Returns:
+            another fit, or the same where it has no others.
+        """
         others = [e.name for e in fit.extension.effects if e.name not in names]
         if not others:
             return fit
