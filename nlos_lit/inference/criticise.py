@@ -268,9 +268,10 @@ class Loop:
     ) -> tuple[list[Member], SurfelFit]:
         """Which of some terms hold, beside each other.
 
-        The least of those that do not hold leaves, a free term before an effect, and all that stay are asked
-        again: of two that stand for each other neither is missed. Those that hold so are asked once more,
-        beside parsimonious scenes.
+        Of two that stand for each other neither is missed. So those without the evidence that they need leave
+        one after the other, each asked when those before it are gone; who has it and is not missed leaves by
+        itself, a free term before an effect; and all that stay are asked again. Those that hold so are asked
+        once more, beside parsimonious scenes.
 
         Args:
             members: whose terms the scene has.
@@ -283,18 +284,28 @@ class Loop:
         """
         staying, left = list(members), dict[str, Member]()
         while staying:
-            asked = self._asked(staying, scene)
+            asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
             if coarse is not None and all(m.accepted for m in staying):
                 staying = self._anew(staying, coarse)
-            failing = [(m, fit) for m, (_, fit) in zip(staying, asked, strict=True) if not m.accepted]
+            failing = [m for m in staying if not m.accepted]
             if not failing:
                 break
-            worst, scene = min(failing, key=lambda pair: (not pair[0].free, _gain(pair[0])))
-            staying.remove(worst)
-            left[worst.name] = worst
+            gone = [m for m in staying if m.name not in enough]
+            gone = gone or [min(failing, key=lambda m: (not m.free, _gain(m)))]
+            scene = self._bare(scene, gone, asked)
+            left |= {m.name: m for m in gone}
+            staying = [m for m in staying if m not in gone]
         now = {m.name: m for m in staying} | left
         return [now[m.name] for m in members], scene
+
+    def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
+        """The scene without members that leave."""
+        names = [m.name for m in gone]
+        if len(gone) == 1:
+            return next(fit for member, fit in asked if member.name == names[0])
+        text, kept = f"going on without {', '.join(names)}", f"left{self.number}_{'_'.join(names)}"
+        return self.steps("fit", text, kept, partial(self.without, scene, names))
 
     def _anew(self, members: list[Member], coarse: SurfelFit) -> list[Member]:
         """Members that hold, asked against parsimonious scenes that were built without them.
@@ -332,8 +343,12 @@ class Loop:
         explained = gain.nats / max(misfit_of(without, select, len(select)), gain.nats, 1e-9)
         return gain, weights([before, value], self.block)[1], explained
 
-    def _asked(self, members: list[Member], scene: SurfelFit) -> list[tuple[Member, SurfelFit]]:
-        """Each of some terms, asked beside the others, and the scene gone on without it."""
+    def _asked(
+        self, members: list[Member], scene: SurfelFit
+    ) -> tuple[list[tuple[Member, SurfelFit]], list[str]]:
+        """Each of some terms, asked beside the others, and the scene gone on without it; who is left when all
+        who have too little evidence are gone.
+        """
         s, select, names = self.settings, self.split.select, [m.name for m in members]
         kept = f"hold{self.number}_{'_'.join(names)}"
         self.steps.plan(fit=1 + len(names), screen=1)
@@ -342,19 +357,23 @@ class Loop:
             (f"going on without {n}", f"{kept}_but_{n}", partial(self.without, scene, [n])) for n in names
         ]
         whole, *fewer = self.steps.several("fit", jobs, s.processes)
-        asking = partial(own_evidence, scene, self.split, s.spots, self.seed, names)
-        own = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
         misfit, value, found = self._misfit(scene), log_likelihood(whole, select), []
+
+        def bar(lit: float) -> float:
+            return self.least + s.share * lit * misfit
+
+        asking = partial(own_evidence, scene, self.split, s.spots, self.seed, names, bar)
+        own, enough = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
         for member, fit in zip(members, fewer, strict=True):
             gain, weight, explained = self._gained(fit, value)
             evidence, lit = own[member.name]
-            confirmed = Confirmed(evidence, self.least + s.share * lit * misfit, gain, weight, explained)
+            confirmed = Confirmed(evidence, bar(lit), gain, weight, explained)
             before = log_likelihood(fit, select)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
             asked = replace(member, confirmed=confirmed, accepted=confirmed.holds, trials=trials)
             found.append((asked, fit))
-        return found
+        return found, enough
 
     def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """Terms with a number for each spot, which are asked last: with them nothing is predicted for others.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -254,10 +254,12 @@ def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:
 
 
 def own_evidence(
-    fit: SurfelFit, split: Split, most: int, seed: int, names: list[str]
-) -> dict[str, tuple[float, float]]:
-    """How much the counts ask for each of several terms that a fit has, beside all else that the fit has and
-    may do.
+    fit: SurfelFit, split: Split, most: int, seed: int, names: list[str], bar: Callable[[float], float]
+) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    """How much the counts ask for each of several terms that a fit has, beside all else that it may do.
+
+    Then who has less than it needs is taken out of the linear problem, one after the other, a free term
+    before an effect, the one that comes least near to what it needs first; what it did is asked of others.
 
     Args:
         fit: with the terms at their fitted values.
@@ -265,34 +267,43 @@ def own_evidence(
         most: fitted spots that are looked at.
         seed: of their choice.
         names: of the terms.
+        bar: nats that a term needs, from how far a misfit may look like it, see :class:`Candidate`.
 
     Returns:
-        nats and ``lit``, as of a candidate, by name.
+        nats and ``lit``, as of a candidate, by name; and who is left.
     """
     problem, block = _problem(fit, split, most, seed, with_effects=False)
     whole = Projector(problem)
     effects = {e.name: e for e in fit.extension.effects}
-    columns = {n: weighted_columns(problem, e, shapes=True) for n, e in effects.items() if not e.per_spot}
+    laws = {n: e for n, e in effects.items() if not e.per_spot}
+    columns = {n: weighted_columns(problem, e, shapes=True) for n, e in laws.items()}
     freed = {n: whole.free(z) for n, z in columns.items()}
+    above = {n: _above_null(e) for n, e in effects.items()}
+    does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
-    def one(name: str) -> tuple[float, float]:
-        effect, others = effects[name], [n for n in freed if n != name]
-        many = math.log(len(effect.shape_grid()))
+    def one(name: str, gone: list[str]) -> tuple[float, float]:
+        effect, others = effects[name], [n for n in laws if n != name and n not in gone]
+        many, at = math.log(len(effect.shape_grid())), above[name]
+        residual = whole.left[:, 0] + sum((does[n] for n in gone if n in does), torch.zeros(()))
         z = torch.cat([whole.left[:, :0], *(freed[n] for n in others)], 1)
         precision = torch.cat([whole.left.new_zeros(0), *(effects[n].precision() for n in others)])
-        at = _above_null(effect)
         if effect.per_spot:
             column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
-            beside = whole.beside(z, precision)
+            beside = whole.beside(z, precision, residual)
             score, information, _ = _scores(problem, beside, effect, column, at[problem.spots])
             return best_width(score, information, sparse(effect))[0] - many, _lit(problem, effect, column)
-        k = len(at)
-        beside = whole.beside(z, precision, whole.left[:, 0] + freed[name][:, :k] @ at)
-        own = (columns[name][:, :k], beside.free(freed[name][:, :k]))
+        beside = whole.beside(z, precision, residual + does[name])
+        own = (columns[name][:, : len(at)], beside.free(freed[name][:, : len(at)]))
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit
 
-    return {name: one(name) for name in names}
+    found, gone = {name: one(name, []) for name in names}, list[str]()
+    now = dict(found)
+    while short := [n for n, (nats, lit) in now.items() if nats <= bar(lit)]:
+        gone.append(min(short, key=lambda n: (n not in FREE_NAMES, now[n][0] / bar(now[n][1]))))
+        del now[gone[-1]]
+        now |= {n: one(n, gone) for n in short if n in now}
+    return found, list(now)
 
 
 def _above_null(effect: Effect) -> Tensor:

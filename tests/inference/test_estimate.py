@@ -310,7 +310,9 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
     """As if the model had all else, and the counts were asked for it from where its absence leaves them."""
     found, measured, split, _ = findings
     fit = fit_of(found.final.model, measured, found.final.extension, split.fit)
-    asked = own_evidence(fit, split, 48, 3, ["irf_tail", "free_wall"])
+    names = ["irf_tail", "free_wall"]
+    asked, left = own_evidence(fit, split, 48, 3, names, lambda lit: -math.inf)
+    assert left == names
     rows = pool.tested_rows(fit, split, 48, 3)
     spots, block = torch.from_numpy(split.fit[rows]), torch.from_numpy(split.block[split.fit[rows]])
     for effect in fit.extension.effects:
@@ -326,6 +328,29 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
             pytest.approx(nats.lit, rel=1e-3),
         )
     assert asked["irf_tail"][0] > 20
+
+
+@FORWARD_MODE
+def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
+    """A free term along time does what the tail does: neither has much beside the other; it leaves first."""
+    found, measured, split, scan = findings
+    tail, free = effect_of("irf_tail", scan, fraction=0.2), effect_of("free_time", scan)
+    fit = fit_of(found.final.model, measured, Extension([tail, free]), split.fit)
+    names = ["irf_tail", "free_time"]
+    both, _ = own_evidence(fit, split, 48, 3, names, lambda lit: -math.inf)
+    alone, _ = own_evidence(
+        fit_of(found.final.model, measured, Extension([tail]), split.fit),
+        split,
+        48,
+        3,
+        ["irf_tail"],
+        lambda lit: -math.inf,
+    )
+    bar = (both["irf_tail"][0] + alone["irf_tail"][0]) / 2
+    asked, left = own_evidence(fit, split, 48, 3, names, lambda lit: bar)
+    assert (asked, left) == (both, ["irf_tail"])
+    assert both["irf_tail"][0] < bar < alone["irf_tail"][0]
+    assert own_evidence(fit, split, 48, 3, names, lambda lit: 2 * alone["irf_tail"][0])[1] == []
 
 
 @FORWARD_MODE

@@ -125,11 +125,12 @@ class World:
         return Pool(found, [Taken(c, rivals.get(c.name, [])) for c in asked])
 
     def own_evidence(
-        self, fit: FakeFit, split, most, seed, names: list[str]
-    ) -> dict[str, tuple[float, float]]:
+        self, fit: FakeFit, split, most, seed, names: list[str], bar
+    ) -> tuple[dict[str, tuple[float, float]], list[str]]:
         assert set(names) <= fit.names
         found = {c.name: c for c in self.pool}
-        return {n: (self.own.get(n, found[n].evidence), found[n].lit) for n in names}
+        own = {n: (self.own.get(n, found[n].evidence), found[n].lit) for n in names}
+        return own, [n for n, (nats, lit) in own.items() if nats > bar(lit)]
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
         fit = FakeFit(extension, seed, anew=True)
