@@ -265,13 +265,14 @@ class Loop:
 
     def hold(
         self, members: list[Member], scene: SurfelFit, coarse: SurfelFit | None = None
-    ) -> tuple[list[Member], SurfelFit]:
+    ) -> tuple[list[Member], SurfelFit, SurfelFit | None]:
         """Which of some terms hold, beside each other.
 
         Of two that stand for each other neither is missed. So those without the evidence that they need leave
         one after the other, each asked when those before it are gone; who has it and is not missed leaves by
-        itself, a free term before an effect; and all that stay are asked again. Those that hold so are asked
-        once more, beside parsimonious scenes.
+        itself, a free term before an effect. The scene has bent itself to those that left: it is built anew
+        with all that stay, who are asked again. Those that hold so are asked once more, beside parsimonious
+        scenes.
 
         Args:
             members: whose terms the scene has.
@@ -279,7 +280,7 @@ class Loop:
             coarse: the parsimonious scene with all of them, where it is to be asked.
 
         Returns:
-            The same members, accepted or not, with none and itself as trials where they are, and the scene
+            The same members, accepted or not, with none and itself as trials where they are, and both scenes
             without those that left.
         """
         staying, left = list(members), dict[str, Member]()
@@ -296,8 +297,30 @@ class Loop:
             scene = self._bare(scene, gone, asked)
             left |= {m.name: m for m in gone}
             staying = [m for m in staying if m not in gone]
+            if coarse is not None and staying:
+                coarse = self.built_with(coarse, [m.name for m in staying])
+                scene = self.better(
+                    self.fine(coarse, f"with_{'_'.join(m.name for m in staying)}"), coarse, scene
+                )
         now = {m.name: m for m in staying} | left
-        return [now[m.name] for m in members], scene
+        return [now[m.name] for m in members], scene, coarse
+
+    def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
+        """A parsimonious scene with some of its terms: gone on with, or built anew.
+
+        Args:
+            coarse: with these terms, and others.
+            names: of those that stay.
+
+        Returns:
+            The one that predicts the select spots better.
+        """
+        left = self.only(coarse, names)
+        make = partial(_rebuilt, self.rebuild, left.extension, self.seed)
+        other = self.steps(
+            "fit", f"rebuilding the scene with {', '.join(names)}", f"built_{'_'.join(names)}", make
+        )
+        return left if other is None else self.better(other, left)
 
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""
@@ -394,7 +417,7 @@ class Loop:
             if not new:
                 return members, scene
             staying = [m for m in members if m.accepted] + [Member(new[0])]
-            staying, with_it = self.hold(staying, self.gone_on(scene, new[:1]))
+            staying, with_it, _ = self.hold(staying, self.gone_on(scene, new[:1]))
             if not staying[-1].accepted:
                 return [*members, staying[-1]], scene
             now = {m.name: m for m in staying}
@@ -553,8 +576,9 @@ def criticise(
         told(first, coarse, found.members)
     scene = first
     if found.members:
-        scene = loop.better(loop.fine(coarse, "with_all"), coarse)
-        found.members, scene = loop.hold(found.members, scene, coarse)
+        grown = loop.better(loop.fine(coarse, "with_all"), coarse)
+        found.members, held, left = loop.hold(found.members, grown, coarse)
+        scene, coarse = (held, left or coarse) if found.accepted else (first, coarse)
     found.members, scene = loop.single_spots(found.members, scene)
     if found.accepted and loop.predicts(scene, first):
         found.members, found.final = loop.named(found.members, scene)

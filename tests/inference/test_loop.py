@@ -149,7 +149,7 @@ class World:
     def hold(self, *names: str) -> tuple[dict[str, Member], FakeFit]:
         """Which of some terms hold, by name, and the scene that is left."""
         found = {c.name: c for c in self.pool}
-        members, scene = self.loop().hold([Member(found[n]) for n in names], fitted(*names, fine=True))
+        members, scene, _ = self.loop().hold([Member(found[n]) for n in names], fitted(*names, fine=True))
         assert [m.name for m in members] == list(names)
         return {m.name: m for m in members}, scene
 
@@ -367,10 +367,29 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
     table = {"irf_tail": nats(70.0), "anew": nats(other), "anew+irf_tail": nats(60.0)}
     world = World(monkeypatch, table, [candidate("irf_tail")])
     coarse = fitted("irf_tail", "hum")
-    (found,), scene = world.loop().hold([Member(world.pool[0])], fitted("irf_tail", fine=True), coarse)
+    (found,), scene, _ = world.loop().hold([Member(world.pool[0])], fitted("irf_tail", fine=True), coarse)
     assert (found.accepted, scene.names) == (accepted, {"irf_tail"} if accepted else set())
     assert found.confirmed.gain.nats == pytest.approx(70.0 - other)
     assert world.rebuilt == [(set(), 4)], "without hum, which is not there any more"
+
+
+def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
+    """It has bent itself to those that left: the best of three goes on."""
+    pool = [candidate("irf_tail"), candidate("vignetting")]
+    for anew, finer, made in (
+        (51.0, 60.0, (True, True)),
+        (60.0, 55.0, (False, True)),
+        (40.0, 41.0, (True, False)),
+    ):
+        table = {"irf_tail": nats(50.0), "anew": nats(-1.0), "anew+irf_tail": nats(anew)}
+        table["fine+anew+irf_tail"] = nats(finer)
+        world = World(monkeypatch, table, pool, {"vignetting": 1.0})
+        members = [Member(c) for c in pool]
+        scenes = fitted("irf_tail", "vignetting", fine=True), fitted("irf_tail", "vignetting")
+        found, scene, coarse = world.loop().hold(members, *scenes)
+        assert [m.accepted for m in found] == [True, False]
+        assert (scene.names, (scene.fine, scene.anew)) == ({"irf_tail"}, made)
+        assert coarse.names == {"irf_tail"}
 
 
 def test_terms_must_predict_better_than_a_finer_scene(monkeypatch):
