@@ -269,10 +269,10 @@ class Loop:
         """Which of some terms hold, beside each other.
 
         Of two that stand for each other neither is missed. So those without the evidence that they need leave
-        one after the other, each asked when those before it are gone; who has it and is not missed leaves by
-        itself, a free term before an effect. The scene has bent itself to those that left: it is built anew
-        with all that stay, who are asked again. Those that hold so are asked once more, beside parsimonious
-        scenes.
+        one after the other, each asked when those before it are gone, and free terms beside the effects that
+        are left; else the one that is missed least leaves. The scene has bent itself to those that left: it
+        is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
+        parsimonious scenes.
 
         Args:
             members: whose terms the scene has.
@@ -293,7 +293,7 @@ class Loop:
             if not failing:
                 break
             gone = [m for m in staying if m.name not in enough]
-            gone = gone or [min(failing, key=lambda m: (not m.free, _gain(m)))]
+            gone = gone or [min(failing, key=_gain)]
             scene = self._bare(scene, gone, asked)
             left |= {m.name: m for m in gone}
             staying = [m for m in staying if m not in gone]

@@ -92,10 +92,6 @@ class Member:
         return self.candidate.name
 
     @property
-    def free(self) -> bool:
-        return self.name in FREE_NAMES
-
-    @property
     def predicts(self) -> bool:
         """With it spots that were not fitted are predicted much better: that is told, if no more."""
         return self.confirmed is not None and self.confirmed.explained > MUCH and self.confirmed.weight > SURE

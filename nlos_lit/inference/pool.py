@@ -258,8 +258,9 @@ def own_evidence(
 ) -> tuple[dict[str, tuple[float, float]], list[str]]:
     """How much the counts ask for each of several terms that a fit has, beside all else that it may do.
 
-    Then who has less than it needs is taken out of the linear problem, one after the other, a free term
-    before an effect, the one that comes least near to what it needs first; what it did is asked of others.
+    Then who has less than it needs is taken out of the linear problem, one after the other, the one that
+    comes least near to it first; what it did is asked of the others. Effects are asked without any free term,
+    free terms beside the effects that are left.
 
     Args:
         fit: with the terms at their fitted values.
@@ -297,13 +298,19 @@ def own_evidence(
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit
 
-    found, gone = {name: one(name, []) for name in names}, list[str]()
-    now = dict(found)
-    while short := [n for n, (nats, lit) in now.items() if nats <= bar(lit)]:
-        gone.append(min(short, key=lambda n: (n not in FREE_NAMES, now[n][0] / bar(now[n][1]))))
-        del now[gone[-1]]
-        now |= {n: one(n, gone) for n in short if n in now}
-    return found, list(now)
+    def left(asked: list[str], gone: list[str]) -> list[str]:
+        now = {n: one(n, gone) for n in asked}
+        while short := [n for n, (nats, lit) in now.items() if nats <= bar(lit)]:
+            worst = min(short, key=lambda n: now[n][0] / bar(now[n][1]))
+            del now[worst]
+            gone = [*gone, worst]
+            now |= {n: one(n, gone) for n in short if n in now}
+        return list(now)
+
+    free = [n for n in names if n in FREE_NAMES]
+    enough = left([n for n in names if n not in free], free)
+    enough += left(free, [n for n in names if n not in free and n not in enough])
+    return {name: one(name, []) for name in names}, enough
 
 
 def _above_null(effect: Effect) -> Tensor:
