@@ -171,9 +171,10 @@ def _of_nothing(diagnosis: Diagnosis) -> str:
             f" allows. Effects weaker than those listed below may still be there.{blind}"
         )
     share = excess_share(diagnosis)
+    tried = " What was tried and is not certain stands in the notes below." if diagnosis.notes else ""
     return (
         f"Limited: the simulation is {percent(share)} above counting noise, for no reason that could be told,"
-        f" and weak effects may hide in that.{blind}"
+        f" and weak effects may hide in that.{tried}{blind}"
     )
 
 

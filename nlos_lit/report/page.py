@@ -177,6 +177,9 @@ def report_html(
         f"{link}</header>",
         _misfit_bar(diagnosis),
         _section("How sure, in numbers", f"<p>{glossed(sureness(diagnosis), known)}</p>"),
+        _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
+        if diagnosis.notes
+        else "",
         _section("What the simulation was extended with", _accepted(diagnosis, diagnosis.effects))
         if diagnosis.effects
         else "",
@@ -196,9 +199,6 @@ def report_html(
         else "",
         _section("The direct pulse as witness", _witness(diagnosis) + shown("witness_"))
         if diagnosis.witness
-        else "",
-        _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
-        if diagnosis.notes
         else "",
         _section("More figures", "".join(images[n] for n in extra)) if extra else "",
         _section("Capture and run", _facts(diagnosis)),

@@ -260,7 +260,7 @@ def diagnosed(findings, null: Null | None = None):
 
 @FORWARD_MODE
 def test_what_is_said_of_accepted_terms(findings):
-    said = diagnosed(findings)
+    found, said = findings[0], diagnosed(findings)
     (tail,), (free,) = said.effects, said.unknown
     # Six and two tenths remain when the map, which was accepted beside, is no rival, nor is none.
     assert tail.weights == pytest.approx({"irf_tail": 0.75, "afterpulsing": 0.25})
@@ -287,6 +287,17 @@ def test_what_is_said_of_accepted_terms(findings):
     )
     assert [s.name for s in said.screened] == ["irf_tail", "afterpulsing", "free_wall", "free_time"]
     assert said.needed == 8
+    assert said.notes == [], "what does not hold predicts nothing much better"
+    last = found.members[2]
+    better = dataclasses.replace(last.confirmed, explained=0.38, evidence=220.0, needed=671.0)
+    told = dataclasses.replace(
+        found, members=[*found.members[:2], dataclasses.replace(last, confirmed=better)]
+    )
+    (note,) = diagnosed((told, *findings[1:])).notes
+    assert note.startswith("afterpulsing was tried and is not named. With it spots that were not fitted are")
+    assert "by 40 ± 1 nats, 38 %" in note
+    assert "220 nats" in note
+    assert "by 671." in note
 
 
 @FORWARD_MODE
