@@ -28,6 +28,7 @@ from nlos_lit.inference.result import (
     Diagnosis,
     Followed,
     Gain,
+    Likely,
     Screened,
     Shape,
     Tried,
@@ -103,11 +104,12 @@ def assemble(
         chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
         if null is None
         else null.chance(largest),
-        notes=[_told(m) for m in found.members if not m.accepted and m.predicts],
+        notes=[],
         capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
+        likely=_likely(found.members),
     )
 
 
@@ -155,16 +157,15 @@ def _accepted(
     )
 
 
-def _told(member: Member) -> str:
-    """That a term is not named although other spots are predicted better with it."""
-    found = member.confirmed
-    assert found is not None  # what makes it predict anything
-    return (
-        f"{member.name} was tried and is not named. With it spots that were not fitted are predicted better, "
-        f"by {found.gain.nats:.0f} ± {found.gain.error:.0f} nats, {100 * found.explained:.0f} % of what they "
-        f"leave unexplained without it. But its own evidence is {found.evidence:.0f} nats, and what the "
-        f"scene leaves unexplained may look like it by {found.needed:.0f}."
-    )
+def _likely(members: list[Member]) -> list[Likely]:
+    """Terms that are not named although other spots are predicted much better with them."""
+    found = [(m.name, m.confirmed) for m in members if m.predicts and not m.accepted]
+    told = [
+        Likely(name, c.gain.nats, c.gain.error, c.explained, c.evidence, c.needed)
+        for name, c in found
+        if c is not None
+    ]
+    return sorted(told, key=lambda one: -one.nats)
 
 
 def _advised(name: str, names: list[str], trials: list[Trial]) -> dict[str, float]:

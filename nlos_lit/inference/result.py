@@ -210,6 +210,25 @@ class Further:
 
 
 @dataclass(frozen=True)
+class Likely:
+    """A term that is not named, although spots that were not fitted are predicted much better with it.
+
+    Args:
+        nats: that they gain. error: of it, over wall blocks.
+        explained: share that it explains of what they leave unexplained without it.
+        evidence: its own, nats, less than …
+        needed: … what the scene leaves unexplained may look like it by.
+    """
+
+    name: str
+    nats: float
+    error: float
+    explained: float
+    evidence: float
+    needed: float
+
+
+@dataclass(frozen=True)
 class Diagnosis:
     """Everything that ``diagnose.py`` found.
 
@@ -221,6 +240,7 @@ class Diagnosis:
         chance: of evidence as large as the largest, without any effect: counted over ``toys``; without toys
             what the theory says.
         further: what other captures said of the groups.
+        likely: terms that were tried, predict much and are not certain, the largest gain first.
     """
 
     effects: list[Accepted]
@@ -241,6 +261,7 @@ class Diagnosis:
     seconds: float
     seed: int
     further: list[Further] = field(default_factory=list)
+    likely: list[Likely] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-serialisable."""

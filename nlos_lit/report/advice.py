@@ -111,6 +111,13 @@ def next_step(diagnosis: Diagnosis, scene: Sequence[str] = (), folder: Path | No
             f"{TELLS.get(worst.axis, FINDER)} Until it has a name, read the picture with care where the"
             f" residual below stands out.{known}"
         )
+    if diagnosis.likely and not at_noise(diagnosis):
+        name = diagnosis.likely[0].name
+        return Advice(
+            f"To be certain: {describe(name).words.remedy} Or put it into the model, and see whether the"
+            " picture becomes clearer:",
+            shlex.join([*base, f"effects=[{name}]"]),
+        )
     refined = shlex.join([*base, "refine=true"])
     if at_noise(diagnosis):
         return Advice(
@@ -171,10 +178,14 @@ def _of_nothing(diagnosis: Diagnosis) -> str:
             f" allows. Effects weaker than those listed below may still be there.{blind}"
         )
     share = excess_share(diagnosis)
-    tried = " What was tried and is not certain stands in the notes below." if diagnosis.notes else ""
+    if diagnosis.likely:
+        return (
+            "Open: what is likely predicts parts of the wall that nothing was fitted to, but its own evidence"
+            f" is less than what a misfit of the scene could look like.{blind}"
+        )
     return (
         f"Limited: the simulation is {percent(share)} above counting noise, for no reason that could be told,"
-        f" and weak effects may hide in that.{tried}{blind}"
+        f" and weak effects may hide in that.{blind}"
     )
 
 

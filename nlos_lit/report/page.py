@@ -177,9 +177,7 @@ def report_html(
         f"{link}</header>",
         _misfit_bar(diagnosis),
         _section("How sure, in numbers", f"<p>{glossed(sureness(diagnosis), known)}</p>"),
-        _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
-        if diagnosis.notes
-        else "",
+        _section("What is likely, and not certain", _likely(diagnosis)) if diagnosis.likely else "",
         _section("What the simulation was extended with", _accepted(diagnosis, diagnosis.effects))
         if diagnosis.effects
         else "",
@@ -199,6 +197,9 @@ def report_html(
         else "",
         _section("The direct pulse as witness", _witness(diagnosis) + shown("witness_"))
         if diagnosis.witness
+        else "",
+        _section("Notes", "<ul>" + "".join(f"<li>{_text(n)}</li>" for n in diagnosis.notes) + "</ul>")
+        if diagnosis.notes
         else "",
         _section("More figures", "".join(images[n] for n in extra)) if extra else "",
         _section("Capture and run", _facts(diagnosis)),
@@ -334,6 +335,19 @@ def _further(further: Further) -> str:
         " it is judged by them."
     )
     return f"<p>{_text(text)}</p>" + _table(heads, rows(further), "cards")
+
+
+def _likely(diagnosis: Diagnosis) -> str:
+    """Terms that were tried and are not named, a paragraph each."""
+    return "".join(
+        f"<p><b>{_text(capital(describe(one.name).phrase))}</b> was tried. With it spots that were not fitted"
+        f" are predicted better by {number(one.nats)} ± {number(one.error, 2)} nats: it explains"
+        f" {_text(percent(one.explained))} of what they leave unexplained without it. Its own evidence is"
+        f" {number(one.evidence)} nats; {number(one.needed)} are needed, since what the scene leaves"
+        " unexplained may look like it by as much. So it is not named, and the simulation was not extended"
+        " with it.</p>"
+        for one in diagnosis.likely
+    )
 
 
 def _unexplained(diagnosis: Diagnosis) -> str:

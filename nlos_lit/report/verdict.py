@@ -75,7 +75,8 @@ def invisible(screened: Screened) -> bool:
 
 def tone(diagnosis: Diagnosis) -> str:
     """``fine``, ``found`` or ``unexplained``."""
-    if diagnosis.unknown:
+    open_ = diagnosis.likely and not diagnosis.effects and excess_share(diagnosis) > AT_NOISE
+    if diagnosis.unknown or open_:
         return "unexplained"
     return "found" if diagnosis.effects else "fine"
 
@@ -266,6 +267,13 @@ def _joined(parts: list[str], word: str) -> str:
 def _nothing(diagnosis: Diagnosis) -> str:
     if at_noise(diagnosis):
         return "Nothing in the registry is needed: the fit is at the noise."
+    if diagnosis.likely:
+        first, above = diagnosis.likely[0], percent(excess_share(diagnosis))
+        return (
+            f"No cause is certain for what is left, {above} above counting noise. The likeliest is"
+            f" {describe(first.name).phrase}, which explains {percent(first.explained)} of it elsewhere on"
+            " the wall; a scene that the fitted surface cannot follow might look so, too."
+        )
     return (
         f"Nothing in the registry is needed: what is left, {percent(excess_share(diagnosis))} above counting"
         " noise, has no clear shape along time, wall, scan or count rate; the fitted surface itself may be"

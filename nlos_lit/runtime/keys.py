@@ -155,7 +155,6 @@ CRITICISM: dict[str, Rule] = {
     "share": number(0, 1),
     "rivals": whole(0, 1000),
     "open_share": number(0, 1),
-    "most_of": number(0, 1),
     "odds": number(0, 1),
     "most": whole(0, 1000),
     "toys": whole(0, 1_000_000),

@@ -11,7 +11,7 @@ from matplotlib.colors import to_hex
 from report_cases import CASES, TAIL, TAIL_ALONE, TILT, UNKNOWN, diagnosis, free, profiles, two_found
 
 from nlos_lit.inference.advise import AGAIN
-from nlos_lit.inference.result import Diagnosis, Estimate, Followed, Gain, Scores
+from nlos_lit.inference.result import Diagnosis, Estimate, Followed, Gain, Likely, Scores
 from nlos_lit.report import diagnosis_figures as plots
 from nlos_lit.report.advice import TELLS, confidence, next_step
 from nlos_lit.report.page import report_html, write_report
@@ -30,10 +30,13 @@ def test_confidence_is_said_in_words():
     shaky = dataclasses.replace(TILT, heldout_gain=Gain(1.2, 1.19, 0.001, (-0.001, 0.003)))
     assert confidence(diagnosis(effects=[shaky])).startswith("Fair: ")
     assert confidence(CASES["nothing"]).startswith("Good, within limits: ")
-    limited = diagnosis(base=ABOVE, untouched_test={}, notes=[])
+    limited = diagnosis(base=ABOVE, untouched_test={})
     assert confidence(limited).startswith("Limited: the simulation is 10 %")
-    assert "in the notes below" not in confidence(limited)
-    assert "in the notes below" in confidence(dataclasses.replace(limited, notes=["irf_tail was tried"]))
+    likely = dataclasses.replace(limited, likely=[Likely("wall_reflectance", 4889, 1073, 0.38, 220, 671)])
+    assert confidence(likely).startswith("Open: what is likely predicts parts of the wall that nothing was")
+    advice = next_step(likely, ["scene=su"])
+    assert advice.text.startswith("To be certain: ")
+    assert advice.command == "nlos train scene=su 'effects=[wall_reflectance]'"
     assert "criticism.toys=20" in confidence(dataclasses.replace(alone, toys=0))
     assert "criticism.toys" not in confidence(dataclasses.replace(alone, toys=20))
     assert "σ" not in confidence(alone)

@@ -32,7 +32,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.result import Accepted, Estimate, Gain, Scores, Screened
+from nlos_lit.inference.result import Accepted, Estimate, Gain, Likely, Scores, Screened
 from nlos_lit.report import diagnosis_figures as plots
 from nlos_lit.report.page import report_html, write_report
 from nlos_lit.report.quantities import (
@@ -45,7 +45,7 @@ from nlos_lit.report.quantities import (
     probability,
     quantity,
 )
-from nlos_lit.report.verdict import misfit, rivals, sureness, tone, verdict
+from nlos_lit.report.verdict import at_noise, misfit, rivals, sureness, tone, verdict
 from nlos_lit.report.words import AXES, describe
 
 
@@ -119,7 +119,7 @@ def test_json_is_the_diagnosis(written, case):
             "seconds",
             "seed",
         ),
-        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys", "further"),
+        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys", "further", "likely"),
     }
     assert set(read["unexplained"]) == {"significant", "axis", "evidence"}
     for effect in [*read["effects"], *read["unknown"]]:
@@ -509,3 +509,19 @@ def test_an_effect_without_words_is_called_by_its_name():
     text = verdict(two_found(effects=[new], groups=[]))
     assert text.startswith("Your simulation misses dust cloud: optical depth 0.40 ± 0.05; modelling it")
     assert headline("irf_tail", {"fraction": Estimate(0.2, 0.02, "1")}) == "fraction 20 ± 2 %"
+
+
+def test_what_is_likely_is_told_and_not_named():
+    """Where the fit is at the noise nothing is left for it to explain."""
+    wall = Likely("wall_reflectance", 4889.0, 1073.0, 0.38, 220.0, 671.0)
+    above = Scores(0.7853, 0.7113, 0.02, 0.015)
+    said = diagnosis(base=above, untouched_test={}, likely=[wall])
+    assert tone(said) == "unexplained"
+    assert verdict(said).startswith("No cause is certain for what is left, 10 % above counting noise.")
+    assert "explains 38 % of it elsewhere on the wall" in verdict(said)
+    page = report_html(said, {})
+    assert "What is likely, and not certain" in page
+    assert "predicted better by 4889 ± 1073 nats" in page
+    calm = diagnosis(base=Scores(0.7113, 0.7113, 0.015, 0.015), untouched_test={}, likely=[wall])
+    assert (tone(calm), at_noise(calm)) == ("fine", True)
+    assert "What is likely" not in report_html(diagnosis(base=above, untouched_test={}), {})

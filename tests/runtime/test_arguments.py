@@ -281,7 +281,10 @@ def run(*words: str) -> subprocess.CompletedProcess:
             "train",
             "scene.threshold: a number above 0 to below 1  # intensity below which there is no surface",
         ),
-        ("diagnose", "criticism.processes: a whole number from 1 to 1024  # that work on them; rebuilds"),
+        (
+            "diagnose",
+            "criticism.processes: a whole number from 1 to 1024  # that work on them; fits that go on",
+        ),
         ("reconstruct", "method.options.snr: a number above 0 to 1e+12  # power of the signal over"),
         ("reconstruct", "  method       bp, dlct, fbp, fk, lct, rsd"),
         ("simulate", "  nx: a whole number from 1 to 10000  # grid points along x and y"),
