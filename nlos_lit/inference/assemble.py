@@ -159,7 +159,7 @@ def _accepted(
 
 def _likely(members: list[Member]) -> list[Likely]:
     """Terms that are not named although other spots are predicted much better with them."""
-    found = [(m.name, m.confirmed) for m in members if m.predicts and not m.accepted]
+    found = [(m.name, m.confirmed) for m in members if m.likely]
     told = [
         Likely(name, c.gain.nats, c.gain.error, c.explained, c.evidence, c.needed)
         for name, c in found

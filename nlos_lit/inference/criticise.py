@@ -52,8 +52,7 @@ class CriticismSettings:
             where the scene's light falls. What is wrong for unknown reasons may look a little like anything.
         most: terms that are tried together at most.
         rivals: look-alikes that are tried in the place of each term that holds, at most.
-        open_share: weight above which the capture leaves something open: that a term is not missed; or that
-            its rival is meant.
+        open_share: weight above which the capture leaves open that a rival is meant.
         odds: share of the best one's weight from which on a simpler rival goes before it.
         toys: simulated captures for the null distribution.
         processes: that work on them; fits that go on side by side.
@@ -224,13 +223,13 @@ class Loop:
         names = "_".join(c.name for c in new)
         self.steps.plan(fit=3)
         warm = self.gone_on(fit, new)
-        other = self.steps(
-            "fit",
-            f"rebuilding the scene with {', '.join(e.name for e in warm.extension.effects)}",
-            f"new{self.number}_{names}",
-            partial(_rebuilt, self.rebuild, warm.extension, self.seed),
-        )
-        return warm if other is None else self.better(other, warm)
+        text = f"rebuilding the scene with {', '.join(e.name for e in warm.extension.effects)}"
+        return self.steps("fit", text, f"new{self.number}_{names}", partial(self._or_anew, warm))
+
+    def _or_anew(self, fit: SurfelFit) -> SurfelFit:
+        """A parsimonious scene, or one built anew with its terms, whichever predicts better."""
+        other = _rebuilt(self.rebuild, fit.extension, self.seed)
+        return fit if other is None else self.better(other, fit)
 
     def better(self, *fits: SurfelFit) -> SurfelFit:
         """The one that predicts the select spots best."""
@@ -315,12 +314,8 @@ class Loop:
         Returns:
             The one that predicts the select spots better.
         """
-        left = self.only(coarse, names)
-        make = partial(_rebuilt, self.rebuild, left.extension, self.seed)
-        other = self.steps(
-            "fit", f"rebuilding the scene with {', '.join(names)}", f"built_{'_'.join(names)}", make
-        )
-        return left if other is None else self.better(other, left)
+        text, kept = f"rebuilding the scene with {', '.join(names)}", f"built_{'_'.join(names)}"
+        return self.steps("fit", text, kept, partial(self._or_anew, self.only(coarse, names)))
 
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""
@@ -343,7 +338,7 @@ class Loop:
             kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
             make = partial(self._without_it, scene, member.name)
             fit = self.steps("fit", f"rebuilding the scene without {member.name}", kept, make)
-            gain, weight, explained = self._gained(fit, value)
+            gain, weight, explained = self._gained(fit, log_likelihood(fit, self.split.select), value)
             old = member.confirmed
             assert old is not None
             least = gain if gain.nats < old.gain.nats else old.gain
@@ -355,14 +350,14 @@ class Loop:
 
     def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
         """A parsimonious scene without a term: gone on with, or built anew, whichever predicts better."""
-        gone = self.without(scene, [name])
-        other = _rebuilt(self.rebuild, gone.extension, self.seed)
-        return gone if other is None else self.better(other, gone)
+        return self._or_anew(self.without(scene, [name]))
 
-    def _gained(self, without: SurfelFit, value: Tensor) -> tuple[Comparison, float, float]:
-        """What select spots gain over a scene without a term, its weight, and the share that it explains."""
-        select, before = self.split.select, log_likelihood(without, self.split.select)
-        gain = compare(before, value, self.block)
+    def _gained(self, without: SurfelFit, before: Tensor, value: Tensor) -> tuple[Comparison, float, float]:
+        """What select spots gain over a scene without a term, its weight, and the share that it explains.
+
+        ``before`` and ``value``, ``[S]`` nats, are without the term and with it.
+        """
+        select, gain = self.split.select, compare(before, value, self.block)
         explained = gain.nats / max(misfit_of(without, select, len(select)), gain.nats, 1e-9)
         return gain, weights([before, value], self.block)[1], explained
 
@@ -380,18 +375,14 @@ class Loop:
             (f"going on without {n}", f"{kept}_but_{n}", partial(self.without, scene, [n])) for n in names
         ]
         whole, *fewer = self.steps.several("fit", jobs, s.processes)
-        misfit, value, found = self._misfit(scene), log_likelihood(whole, select), []
-
-        def bar(lit: float) -> float:
-            return self.least + s.share * lit * misfit
-
+        bar, value, found = partial(self._bar, self._misfit(scene)), log_likelihood(whole, select), []
         asking = partial(own_evidence, scene, self.split, s.spots, self.seed, names, bar)
         own, enough = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
         for member, fit in zip(members, fewer, strict=True):
-            gain, weight, explained = self._gained(fit, value)
+            before = log_likelihood(fit, select)
+            gain, weight, explained = self._gained(fit, before, value)
             evidence, lit = own[member.name]
             confirmed = Confirmed(evidence, bar(lit), gain, weight, explained)
-            before = log_likelihood(fit, select)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
             asked = replace(member, confirmed=confirmed, accepted=confirmed.holds, trials=trials)
@@ -471,7 +462,11 @@ class Loop:
 
     def needed(self, fit: SurfelFit) -> float:
         """Nats of own evidence that a term needs beside a fine scene, if it acts where its light falls."""
-        return self.least + self.settings.share * self._misfit(fit)
+        return self._bar(self._misfit(fit), 1.0)
+
+    def _bar(self, misfit: float, lit: float) -> float:
+        """Nats that a term needs, of whose information ``lit`` lies where the scene's light falls."""
+        return self.least + self.settings.share * lit * misfit
 
     def settled(self, member: Member) -> Member:
         """A member with what its rivals are worth in its place.

@@ -92,9 +92,10 @@ class Member:
         return self.candidate.name
 
     @property
-    def predicts(self) -> bool:
-        """With it spots that were not fitted are predicted much better: that is told, if no more."""
-        return self.confirmed is not None and self.confirmed.explained > MUCH and self.confirmed.weight > SURE
+    def likely(self) -> bool:
+        """It does not hold, although spots that were not fitted are predicted much better with it."""
+        found = self.confirmed
+        return not self.accepted and found is not None and found.explained > MUCH and found.weight > SURE
 
     @property
     def trial(self) -> Trial:

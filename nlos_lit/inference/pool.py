@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -282,7 +283,8 @@ def own_evidence(
     above = {n: _above_null(e) for n, e in effects.items()}
     does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
-    def one(name: str, gone: list[str]) -> tuple[float, float]:
+    @cache
+    def one(name: str, gone: tuple[str, ...]) -> tuple[float, float]:
         effect, others = effects[name], [n for n in laws if n != name and n not in gone]
         many, at = math.log(len(effect.shape_grid())), above[name]
         residual = whole.left[:, 0] + sum((does[n] for n in gone if n in does), torch.zeros(()))
@@ -298,19 +300,19 @@ def own_evidence(
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit
 
-    def left(asked: list[str], gone: list[str]) -> list[str]:
+    def left(asked: list[str], gone: tuple[str, ...]) -> list[str]:
         now = {n: one(n, gone) for n in asked}
         while short := [n for n, (nats, lit) in now.items() if nats <= bar(lit)]:
             worst = min(short, key=lambda n: now[n][0] / bar(now[n][1]))
             del now[worst]
-            gone = [*gone, worst]
+            gone = (*gone, worst)
             now |= {n: one(n, gone) for n in short if n in now}
         return list(now)
 
     free = [n for n in names if n in FREE_NAMES]
-    enough = left([n for n in names if n not in free], free)
-    enough += left(free, [n for n in names if n not in free and n not in enough])
-    return {name: one(name, []) for name in names}, enough
+    enough = left([n for n in names if n not in free], tuple(free))
+    enough += left(free, tuple(n for n in names if n not in free and n not in enough))
+    return {name: one(name, ()) for name in names}, enough
 
 
 def _above_null(effect: Effect) -> Tensor:

@@ -111,8 +111,9 @@ def next_step(diagnosis: Diagnosis, scene: Sequence[str] = (), folder: Path | No
             f"{TELLS.get(worst.axis, FINDER)} Until it has a name, read the picture with care where the"
             f" residual below stands out.{known}"
         )
-    if diagnosis.likely and not at_noise(diagnosis):
-        name = diagnosis.likely[0].name
+    likely = [one.name for one in diagnosis.likely if not describe(one.name).free]
+    if likely and not at_noise(diagnosis):
+        name = likely[0]
         return Advice(
             f"To be certain: {describe(name).words.remedy} Or put it into the model, and see whether the"
             " picture becomes clearer:",

@@ -339,9 +339,9 @@ def test_what_is_predicted_much_better_is_told(monkeypatch, gain, told):
     )
     found, _ = world.hold("irf_tail")
     assert found["irf_tail"].confirmed.explained == pytest.approx(gain / 40, abs=1e-6)
-    assert (found["irf_tail"].accepted, found["irf_tail"].predicts) == (False, told)
+    assert (found["irf_tail"].accepted, found["irf_tail"].likely) == (False, told)
     open_ = replace(found["irf_tail"].confirmed, weight=0.94)
-    assert not replace(found["irf_tail"], confirmed=open_).predicts
+    assert not replace(found["irf_tail"], confirmed=open_).likely
 
 
 def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):

@@ -37,6 +37,10 @@ def test_confidence_is_said_in_words():
     advice = next_step(likely, ["scene=su"])
     assert advice.text.startswith("To be certain: ")
     assert advice.command == "nlos train scene=su 'effects=[wall_reflectance]'"
+    free = dataclasses.replace(likely.likely[0], name="free_time")
+    two = dataclasses.replace(likely, likely=[free, *likely.likely])
+    assert next_step(two, ["scene=su"]) == advice, "no model can be given a free term"
+    assert "scene.volume.depth" in next_step(dataclasses.replace(likely, likely=[free])).text
     assert "criticism.toys=20" in confidence(dataclasses.replace(alone, toys=0))
     assert "criticism.toys" not in confidence(dataclasses.replace(alone, toys=20))
     assert "σ" not in confidence(alone)
