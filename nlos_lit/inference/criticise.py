@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -160,6 +161,14 @@ def go_on(fit: SurfelFit) -> SurfelFit:
     return solve_spots(fit)
 
 
+class Held(NamedTuple):
+    """Terms that hold, the scene with them, and the parsimonious one."""
+
+    members: list[Member]
+    scene: SurfelFit
+    coarse: SurfelFit
+
+
 class Loop:
     """All that is tried on one capture.
 
@@ -190,12 +199,13 @@ class Loop:
         self.block = split.block[split.select]
         self.least = math.log((len(EFFECTS) + len(FREE)) / settings.level)
 
-    def ask(self, fit: SurfelFit, room: int, of_spots: bool = False) -> Pool:
+    def ask(self, fit: SurfelFit, room: int, effects: bool = True, of_spots: bool = False) -> Pool:
         """What the counts ask for beside a fit.
 
         Args:
             fit: that is criticised.
             room: for so many terms that are taken together.
+            effects: such may be taken; free terms may where none is.
             of_spots: only terms with a number for each spot are asked.
 
         Returns:
@@ -203,7 +213,7 @@ class Loop:
         """
         self.number += 1
         s, only = self.settings, OF_SPOTS if of_spots else None
-        asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed, self.least, room, only)
+        asking = partial(ask, fit, self.split, self.scan, s.spots, self.seed, self.least, room, effects, only)
         text = "asking single spots" if of_spots else "asking the pool"
         return self.steps("screen", f"{text}, {self.number}", f"pool{self.number}", asking)
 
@@ -259,11 +269,15 @@ class Loop:
         Returns:
             another fit.
         """
-        text = f"refining the scene {name.replace('_', ' ')}"
-        return self.steps("fit", text, f"fine_{name}", lambda: solve_spots(self.grow(fit, self.seed)))
+        text, kept = f"refining the scene {name.replace('_', ' ')}", f"fine{self.number}_{name}"
+        return self.steps("fit", text, kept, lambda: solve_spots(self.grow(fit, self.seed)))
 
     def hold(
-        self, members: list[Member], scene: SurfelFit, coarse: SurfelFit | None = None
+        self,
+        members: list[Member],
+        scene: SurfelFit,
+        coarse: SurfelFit | None = None,
+        before: Held | None = None,
     ) -> tuple[list[Member], SurfelFit, SurfelFit | None]:
         """Which of some terms hold, beside each other.
 
@@ -277,6 +291,7 @@ class Loop:
             members: whose terms the scene has.
             scene: with all of them.
             coarse: the parsimonious scene with all of them, where it is to be asked.
+            before: what held before others came; it stands where none of these holds.
 
         Returns:
             The same members, accepted or not, with none and itself as trials where they are, and both scenes
@@ -293,14 +308,17 @@ class Loop:
                 break
             gone = [m for m in staying if m.name not in enough]
             gone = gone or [min(failing, key=_gain)]
-            scene = self._bare(scene, gone, asked)
             left |= {m.name: m for m in gone}
             staying = [m for m in staying if m not in gone]
-            if coarse is not None and staying:
-                coarse = self.built_with(coarse, [m.name for m in staying])
-                scene = self.better(
-                    self.fine(coarse, f"with_{'_'.join(m.name for m in staying)}"), coarse, scene
-                )
+            if before is not None and {m.name for m in staying} == {m.name for m in before.members}:
+                staying, scene, coarse = before
+                break
+            if coarse is None:
+                scene = self._bare(scene, gone, asked)
+            elif staying:
+                names = [m.name for m in staying]
+                coarse = self.built_with(coarse, names)
+                scene = self.better(self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
         now = {m.name: m for m in staying} | left
         return [now[m.name] for m in members], scene, coarse
 
@@ -314,7 +332,7 @@ class Loop:
         Returns:
             The one that predicts the select spots better.
         """
-        text, kept = f"rebuilding the scene with {', '.join(names)}", f"built_{'_'.join(names)}"
+        text, kept = f"rebuilding the scene with {', '.join(names)}", f"built{self.number}_{'_'.join(names)}"
         return self.steps("fit", text, kept, partial(self._or_anew, self.only(coarse, names)))
 
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
@@ -457,7 +475,7 @@ class Loop:
         others = [e.name for e in fit.extension.effects if e.name not in names]
         if not others:
             return fit
-        text, kept = f"going on without {', '.join(others)}", f"only_{'_'.join(names)}"
+        text, kept = f"going on without {', '.join(others)}", f"only{self.number}_{'_'.join(names)}"
         return self.steps("fit", text, kept, partial(self.without, fit, others))
 
     def needed(self, fit: SurfelFit) -> float:
@@ -559,25 +577,34 @@ def criticise(
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
     first = loop.fine(base, "without_effects")
-    found, coarse = Findings(first, first, loop.needed(first)), base
+    found, held, coarse = Findings(first, first, loop.needed(first)), Held([], first, base), base
     told(first, first, [])
-    while True:
-        pool = loop.ask(coarse, s.most - len(found.members))
-        found.pools.append(pool)
-        if not pool.together:
-            break
-        coarse = loop.joined(coarse, [t.candidate for t in pool.together])
-        found.members += [Member(t.candidate, t.rivals) for t in pool.together]
-        told(first, coarse, found.members)
-    scene = first
-    if found.members:
-        grown = loop.better(loop.fine(coarse, "with_all"), coarse)
-        found.members, held, left = loop.hold(found.members, grown, coarse)
-        scene, coarse = (held, left or coarse) if found.accepted else (first, coarse)
-    found.members, scene = loop.single_spots(found.members, scene)
+
+    def asked(effects: bool) -> Pool:
+        found.pools.append(loop.ask(coarse, s.most - len(found.members), effects))
+        return found.pools[-1]
+
+    pool = asked(effects=True)
+    for free in (False, True):
+        new = list[Member]()
+        while come := [Member(t.candidate, t.rivals) for t in pool.together if t.free == free]:
+            coarse = loop.joined(coarse, [m.candidate for m in come])
+            new, found.members = new + come, found.members + come
+            told(first, coarse, found.members)
+            pool = asked(effects=not free)
+        if new:
+            grown = loop.better(loop.fine(coarse, "with_all"), coarse)
+            tried, scene, left = loop.hold(held.members + new, grown, coarse, held)
+            now = {m.name: m for m in tried}
+            found.members = [now.get(m.name, m) for m in found.members]
+            held = Held(found.accepted, scene, left or coarse)
+        if held.coarse is not coarse and not free:
+            coarse = held.coarse
+            pool = asked(effects=False)
+    found.members, scene = loop.single_spots(found.members, held.scene)
     if found.accepted and loop.predicts(scene, first):
         found.members, found.final = loop.named(found.members, scene)
-        found.again = loop.only(coarse, [m.name for m in found.accepted])
+        found.again = loop.only(held.coarse, [m.name for m in found.accepted])
     else:
         found.members = [replace(m, accepted=False) for m in found.members]
     told(first, found.final, found.members)

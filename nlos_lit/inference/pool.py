@@ -86,6 +86,11 @@ class Taken:
     candidate: Candidate
     rivals: list[Candidate]
 
+    @property
+    def free(self) -> bool:
+        """It is a free term."""
+        return self.candidate.name in FREE_NAMES
+
 
 @dataclass(frozen=True)
 class Pool:
@@ -152,6 +157,7 @@ def ask(
     seed: int,
     least: float = math.inf,
     room: int = 0,
+    effects: bool = True,
     only: Container[str] | None = None,
 ) -> Pool:
     """Every term that the fit does not have yet.
@@ -164,6 +170,7 @@ def ask(
         seed: of their choice.
         least: nats that a term needs to be taken.
         room: for terms that are taken together.
+        effects: such may be taken.
         only: names of those that are asked; None asks all.
 
     Returns:
@@ -174,7 +181,7 @@ def ask(
     have = {e.name for e in fit.extension.effects}
     terms = [e for e in [*EFFECTS, *FREE] if only is None or e.name in only]
     found = screen(problem, [e(scan) for e in terms if e.name not in have], block, projector)
-    return Pool(found, together(problem, projector, block, found, least, room))
+    return Pool(found, together(problem, projector, block, found, least, room, effects))
 
 
 def together(
@@ -184,13 +191,14 @@ def together(
     candidates: list[Candidate],
     least: float,
     room: int,
+    effects: bool = True,
 ) -> list[Taken]:
     """Terms that are asked for beside each other: each beside all that were taken before it.
 
     Strong faults hide one another, and the same trace may be that of several terms. So the one that is asked
     for most is taken, its columns go to what the base can do by itself, and all others are asked again. Of
-    those that have most of the largest evidence the simplest is taken; free terms come after all effects, for
-    what these leave.
+    those that have most of the largest evidence the simplest is taken. Free terms are taken only where no
+    effect is: a scene that was fitted with one has less need of the effect that it stands for.
 
     Args:
         problem: of the tested spots.
@@ -199,6 +207,7 @@ def together(
         candidates: the pool; terms with a number for each spot are not taken.
         least: nats that a term needs.
         room: for so many.
+        effects: such may be taken.
 
     Returns:
         in the order in which they were taken.
@@ -210,8 +219,6 @@ def together(
 
     def beside(left: list[Candidate]) -> list[Candidate]:
         """The same terms, asked again beside those that were taken."""
-        if not known:
-            return left
         columns, precision = (torch.cat(parts, -1) for parts in zip(*known, strict=True))
         other, found = projector.beside(columns, precision), []
         for c in left:
@@ -219,12 +226,11 @@ def together(
             found.append(_seen_again(c, _evidence(problem, other, c.effect, raw[c.name], z, block)))
         return found
 
-    for free in (False, True):
-        asked = [c for c in loud if (c.name in FREE_NAMES) == free]
-        for c in asked if len(taken) < room else []:
+    for free in (False, True) if effects else (True,):
+        asked = [] if taken else [c for c in loud if (c.name in FREE_NAMES) == free]
+        for c in asked:
             raw[c.name] = weighted_columns(problem, c.effect)
             freed[c.name] = projector.free(raw[c.name])
-        asked = beside(asked) if len(taken) < room else []
         while len(taken) < room:
             best = max((c.evidence for c in asked), default=0.0)
             near = [c for c in asked if c.evidence > max(least, MOST * best)]

@@ -512,26 +512,28 @@ def alike(monkeypatch) -> list[Candidate]:
 
 
 def taken(
-    strengths: list[float], traces: Tensor, room: int, unknown: float = 0.0
+    strengths: list[float], traces: Tensor, room: int, unknown: float = 0.0, effects: bool = True
 ) -> list[tuple[str, list[str]]]:
     more = unknown * normal(ROWS, 9, seed=31).sum(1)
     whole = problem(traces @ torch.tensor(strengths) + more + normal(ROWS, seed=2))
     projector = Projector(whole)
     found = screen(whole, [effect_of(n, SCAN) for n in ALIKE], BLOCK, projector)
-    told = pool.together(whole, projector, BLOCK, found, 5.0, room)
+    told = pool.together(whole, projector, BLOCK, found, 5.0, room, effects)
     return [(t.candidate.name, [c.name for c in t.rivals]) for t in told]
 
 
 def test_terms_are_asked_for_beside_those_that_were_taken(alike):
     """The first leaves nothing for what looks like it, which is its rival; the other is asked for as before.
-    A free term that could do the same comes after all effects, when nothing is left for it.
+    A free term is taken only where no effect is, or none may be.
     """
     assert taken([2.0, 0.0, 1.0], alike, 9) == [("irf_tail", ["afterpulsing"]), ("pile_up", [])]
     assert taken([2.0, 0.0, 1.0], alike, 1) == [("irf_tail", ["afterpulsing"])]
     assert taken([2.0, 0.0, 1.0], alike, 0) == []
     assert taken([0.0, 0.0, 0.0], alike, 9) == []
     names = [name for name, _ in taken([2.0, 0.0, 1.0], alike, 9, 0.5)]
-    assert (names[-1], len(names)) == ("free_rate", 3), "effects leave something to it"
+    assert (len(names), "free_rate" in names) == (2, False)
+    for strengths, effects in (([2.0, 0.0, 1.0], False), ([0.0, 0.0, 0.0], True)):
+        assert taken(strengths, alike, 9, 0.5, effects) == [("free_rate", [])]
 
 
 def test_a_term_with_a_prior_keeps_its_scale(known):

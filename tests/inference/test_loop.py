@@ -16,11 +16,12 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference import criticise as loop
 from nlos_lit.inference import members
 from nlos_lit.inference.criticise import (
     CriticismSettings,
+    Held,
     Loop,
     begun_with,
     copy_effects,
@@ -117,10 +118,14 @@ class World:
             return self.table["+".join(names)]
         return sum((self.table[n] for n in names if n in self.table), NOTHING)
 
-    def ask(self, fit: FakeFit, split, scan, most, seed, least: float, room: int, only) -> Pool:
+    def ask(
+        self, fit: FakeFit, split, scan, most, seed, least: float, room: int, effects: bool, only
+    ) -> Pool:
         shown = [c for c in self.pool if self.beside.get(c.name, set()) <= fit.names]
         found = [c for c in shown if c.name not in fit.names and (only is None or c.name in only)]
-        asked = [c for c in found if c.evidence > least and not c.effect.per_spot][:room]
+        asked = [c for c in found if c.evidence > least and not c.effect.per_spot]
+        named = [c for c in asked if c.name not in FREE_NAMES]
+        asked = ((effects and named) or [c for c in asked if c.name in FREE_NAMES])[:room]
         rivals = {n: [candidate(r) for r in names] for n, names in self.rivals.items()}
         return Pool(found, [Taken(c, rivals.get(c.name, [])) for c in asked])
 
@@ -287,6 +292,23 @@ def test_terms_come_together_and_others_after_them(monkeypatch):
     assert names_of(found.members) == ["irf_tail", "pile_up"]
 
 
+def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
+    """Not together with them, nor beside one that left. Where none of them holds all is as it was before."""
+    pool = [candidate("free_time", 400.0), candidate("irf_tail", 300.0), candidate("pile_up", 200.0)]
+    for gained in (30.0, -1.0):
+        table = {"irf_tail": gaining(40.0), "free_time": gaining(gained, 1)}
+        world = World(monkeypatch, table, pool, {"pile_up": 1.0})
+        found = world.criticise()
+        holding = {"irf_tail", "free_time"} if gained > 0 else {"irf_tail"}
+        assert names_of(found.members) == ["irf_tail", "pile_up", "free_time"]
+        assert {m.name for m in found.accepted} == found.final.names == found.again.names == holding
+        built = [names for names, _ in world.rebuilt]
+        assert built[0] == {"irf_tail", "pile_up"}
+        assert all("pile_up" not in names for names in built[1:]), "it has left"
+        assert world.grown[:3] == [set(), {"irf_tail", "pile_up"}, {"irf_tail"}]
+        assert world.grown[3:] == [{"irf_tail", "free_time"}], "and not again without it"
+
+
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
     """The one that was gone on with, or one from new seeds, where surfels that imitated the terms do not come
     back; none where no surfel survives.
@@ -365,14 +387,16 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
     table = {"irf_tail": nats(70.0), "anew": nats(other), "anew+irf_tail": nats(60.0)}
     world = World(monkeypatch, table, [candidate("irf_tail")])
     coarse = fitted("irf_tail", "hum")
-    (found,), scene, _ = world.loop().hold([Member(world.pool[0])], fitted("irf_tail", fine=True), coarse)
+    before = Held([], fitted(fine=True), fitted())
+    members = [Member(world.pool[0])]
+    (found,), scene, _ = world.loop().hold(members, fitted("irf_tail", fine=True), coarse, before)
     assert (found.accepted, scene.names) == (accepted, {"irf_tail"} if accepted else set())
     assert found.confirmed.gain.nats == pytest.approx(70.0 - other)
     assert world.rebuilt == [(set(), 4)], "without hum, which is not there any more"
 
 
 def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
-    """It has bent itself to those that left: the best of three goes on."""
+    """It has bent itself to those that left, and does not go on: a finer one does, where that is better."""
     pool = [candidate("irf_tail"), candidate("vignetting")]
     for anew, finer, made in (
         (51.0, 60.0, (True, True)),
