@@ -290,8 +290,9 @@ class Loop:
         Args:
             members: whose terms the scene has.
             scene: with all of them.
-            coarse: the parsimonious scene with all of them, where it is to be asked.
-            before: what held before others came; it stands where none of these holds.
+            coarse: the parsimonious scene with all of them, where it is to be asked; then also
+            before: terms that held before these came, and are not asked again. Where none of these holds all
+                is as it was.
 
         Returns:
             The same members, accepted or not, with none and itself as trials where they are, and both scenes
@@ -310,13 +311,12 @@ class Loop:
             gone = gone or [min(failing, key=_gain)]
             left |= {m.name: m for m in gone}
             staying = [m for m in staying if m not in gone]
-            if before is not None and {m.name for m in staying} == {m.name for m in before.members}:
-                staying, scene, coarse = before
-                break
-            if coarse is None:
+            if coarse is None or before is None:
                 scene = self._bare(scene, gone, asked)
-            elif staying:
-                names = [m.name for m in staying]
+            elif not staying:
+                scene, coarse = before.scene, before.coarse
+            else:
+                names = [m.name for m in [*before.members, *staying]]
                 coarse = self.built_with(coarse, names)
                 scene = self.better(self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
         now = {m.name: m for m in staying} | left
@@ -349,12 +349,11 @@ class Loop:
         A scene that has bent itself to a term cannot go on without it as well as one that never had it.
         """
         names = [m.name for m in members]
-        scene = self.only(coarse, names)
-        value, found = log_likelihood(scene, self.split.select), []
+        value, found = log_likelihood(coarse, self.split.select), []
         self.steps.plan(fit=len(names))
         for member in members:
             kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
-            make = partial(self._without_it, scene, member.name)
+            make = partial(self._without_it, coarse, member.name)
             fit = self.steps("fit", f"rebuilding the scene without {member.name}", kept, make)
             gain, weight, explained = self._gained(fit, log_likelihood(fit, self.split.select), value)
             old = member.confirmed
@@ -594,7 +593,7 @@ def criticise(
             pool = asked(effects=not free)
         if new:
             grown = loop.better(loop.fine(coarse, "with_all"), coarse)
-            tried, scene, left = loop.hold(held.members + new, grown, coarse, held)
+            tried, scene, left = loop.hold(new, grown, coarse, held)
             now = {m.name: m for m in tried}
             found.members = [now.get(m.name, m) for m in found.members]
             held = Held(found.accepted, scene, left or coarse)

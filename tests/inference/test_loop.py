@@ -104,6 +104,7 @@ class World:
         self.beside, self.rivals = beside or {}, rivals or {}
         self.rebuilt: list[tuple[frozenset[str], int]] = []
         self.grown: list[frozenset[str]] = []
+        self.asked: list[list[str]] = []
         monkeypatch.setattr(loop, "solve", lambda *_: None)
         monkeypatch.setattr(loop, "log_likelihood", self.likelihood)
         monkeypatch.setattr(loop, "ask", self.ask)
@@ -133,6 +134,7 @@ class World:
         self, fit: FakeFit, split, most, seed, names: list[str], bar
     ) -> tuple[dict[str, tuple[float, float]], list[str]]:
         assert set(names) <= fit.names
+        self.asked.append(names)
         found = {c.name: c for c in self.pool}
         own = {n: (self.own.get(n, found[n].evidence), found[n].lit) for n in names}
         return own, [n for n, (nats, lit) in own.items() if nats > bar(lit)]
@@ -293,7 +295,9 @@ def test_terms_come_together_and_others_after_them(monkeypatch):
 
 
 def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
-    """Not together with them, nor beside one that left. Where none of them holds all is as it was before."""
+    """Not together with them, nor beside one that left. The effects are not asked again, since a scene that was
+    fitted with a free term has less need of them. Where none of them holds all is as it was before.
+    """
     pool = [candidate("free_time", 400.0), candidate("irf_tail", 300.0), candidate("pile_up", 200.0)]
     for gained in (30.0, -1.0):
         table = {"irf_tail": gaining(40.0), "free_time": gaining(gained, 1)}
@@ -307,6 +311,7 @@ def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
         assert all("pile_up" not in names for names in built[1:]), "it has left"
         assert world.grown[:3] == [set(), {"irf_tail", "pile_up"}, {"irf_tail"}]
         assert world.grown[3:] == [{"irf_tail", "free_time"}], "and not again without it"
+        assert world.asked == [["irf_tail", "pile_up"], ["irf_tail"], ["free_time"]]
 
 
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
@@ -386,13 +391,13 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
     """The scene has bent itself to the term, and cannot go on without it; one from new seeds can."""
     table = {"irf_tail": nats(70.0), "anew": nats(other), "anew+irf_tail": nats(60.0)}
     world = World(monkeypatch, table, [candidate("irf_tail")])
-    coarse = fitted("irf_tail", "hum")
+    coarse = fitted("irf_tail")
     before = Held([], fitted(fine=True), fitted())
     members = [Member(world.pool[0])]
     (found,), scene, _ = world.loop().hold(members, fitted("irf_tail", fine=True), coarse, before)
     assert (found.accepted, scene.names) == (accepted, {"irf_tail"} if accepted else set())
     assert found.confirmed.gain.nats == pytest.approx(70.0 - other)
-    assert world.rebuilt == [(set(), 4)], "without hum, which is not there any more"
+    assert world.rebuilt == [(set(), 4)]
 
 
 def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
@@ -408,7 +413,7 @@ def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
         world = World(monkeypatch, table, pool, {"vignetting": 1.0})
         members = [Member(c) for c in pool]
         scenes = fitted("irf_tail", "vignetting", fine=True), fitted("irf_tail", "vignetting")
-        found, scene, coarse = world.loop().hold(members, *scenes)
+        found, scene, coarse = world.loop().hold(members, *scenes, Held([], fitted(), fitted()))
         assert [m.accepted for m in found] == [True, False]
         assert (scene.names, (scene.fine, scene.anew)) == ({"irf_tail"}, made)
         assert coarse.names == {"irf_tail"}
