@@ -80,6 +80,7 @@ UNKNOWN = {name: free(name, shape.axis, shape) for name, shape in SHAPES.items()
 WITNESS = {
     "direct_pulse_counts": 1234567,
     "wall_gain_correlation": 0.803,
+    "wall_gain_by_chance": 0.412,
     "tail_decay_fitted_m": 0.117,
     "tail_decay_direct_m": [0.078, 0.111],
     "maps": {"direct": [[1.0, 2.0, 3.0], [2.0, 4.0, 6.0]], "fitted": [[0.1, 0.2, 0.28], [0.2, 0.41, None]]},

@@ -27,9 +27,9 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
         fit: to the gate alone.
 
     Returns:
-        Correlation of the fitted gain with the pulse's energy per spot, both tails' decays (m of path), the
-        maps, and what single spots' delays, fitted and of the pulse, have over their neighbours (m of path)
-        with their correlation; None without the pulse.
+        Correlation of the fitted gain with the pulse's energy per spot, and what it is by chance, both tails'
+        decays (m of path), the maps, and what single spots' delays, fitted and of the pulse, have over their
+        neighbours (m of path) with their correlation; None without the pulse.
     """
     first = capture.gate[0]
     before = capture.counts[:, :first].sum(1, dtype=np.float64)
@@ -38,6 +38,7 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
     found: dict[str, Any] = {
         "direct_pulse_counts": float(before.mean()),
         "wall_gain_correlation": None,
+        "wall_gain_by_chance": None,
         "tail_decay_fitted_m": None,
         "tail_decay_direct_m": None,
         "maps": None,
@@ -48,8 +49,10 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
     if gain is not None:
         found["wall_gain_correlation"] = float(np.corrcoef(gain, np.log(before.clip(1)))[0, 1])
         if capture.scan_shape is not None and len(capture.scan_shape) == 2:
-            maps = {"direct": before / before.mean(), "fitted": np.exp(gain)}
-            found["maps"] = {name: m.reshape(capture.scan_shape).tolist() for name, m in maps.items()}
+            maps = {"direct": before.clip(1) / before.mean(), "fitted": np.exp(gain)}
+            shaped = {name: m.reshape(capture.scan_shape) for name, m in maps.items()}
+            found["maps"] = {name: m.tolist() for name, m in shaped.items()}
+            found["wall_gain_by_chance"] = by_chance(np.log(shaped["fitted"]), np.log(shaped["direct"]))
     slow = [e for e in fit.extension.effects if e.witness == "tail"]
     if slow:
         first_acting = min(slow, key=lambda e: EFFECTS.index(type(e)))
@@ -67,6 +70,32 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
             found["delay_correlation"] = float(np.corrcoef(delays["direct"], delays["fitted"])[0, 1])
             found["delays"] = {name: d.tolist() for name, d in delays.items()}
     return found
+
+
+def by_chance(one: np.ndarray, other: np.ndarray) -> float:
+    """How well two maps agree where they should not: with one of them turned or mirrored.
+
+    Smooth maps have few degrees of freedom. Two slopes in directions that know nothing of each other
+    correlate by more than 0.7 in one of two cases.
+
+    Args:
+        one: ``[nx, ny]``.
+        other: the same.
+
+    Returns:
+        The largest correlation, without its sign, over all other ways in which one fits the other.
+
+    Examples:
+        >>> rising = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
+        >>> round(by_chance(rising, rising), 2)
+        1.0
+        >>> spot = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+        >>> round(by_chance(spot, spot), 2)
+        0.2
+    """
+    turns = range(4) if one.shape[0] == one.shape[1] else (0, 2)
+    ways = [np.rot90(m, k) for k in turns for m in (other, other[::-1])][1:]
+    return max(abs(float(np.corrcoef(one.ravel(), way.ravel())[0, 1])) for way in ways)
 
 
 def direct_delays(capture: Capture) -> np.ndarray:

@@ -450,6 +450,9 @@ def _witness(diagnosis: Diagnosis) -> str:
     )
     if r is not None:
         rows.append(["Correlation of the fitted wall gain with it (1: the same, 0: unrelated)", number(r)])
+    if w.get("wall_gain_by_chance") is not None:
+        chance = "Its largest with the pulse's map turned or mirrored: what smooth maps share by chance"
+        rows.append([chance, number(w["wall_gain_by_chance"])])
     if fitted is not None:
         rows.append(["Decay of the fitted tail", amount_of("time", fitted)])
     if direct:

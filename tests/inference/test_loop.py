@@ -295,8 +295,8 @@ def test_terms_come_together_and_others_after_them(monkeypatch):
 
 
 def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
-    """Not together with them, nor beside one that left. The effects are not asked again, since a scene that was
-    fitted with a free term has less need of them. Where none of them holds all is as it was before.
+    """Not together with them, nor beside one that left. The effects are not asked again, since a scene that
+    was fitted with a free term has less need of them. Where none of them holds all is as it was before.
     """
     pool = [candidate("free_time", 400.0), candidate("irf_tail", 300.0), candidate("pile_up", 200.0)]
     for gained in (30.0, -1.0):

@@ -24,7 +24,14 @@ from nlos_lit.inference.per_spot import neighbours
 from nlos_lit.inference.pool import Pool
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
-from nlos_lit.inference.witness import direct_decays, direct_delays, log_gain, over_neighbours, witness
+from nlos_lit.inference.witness import (
+    by_chance,
+    direct_decays,
+    direct_delays,
+    log_gain,
+    over_neighbours,
+    witness,
+)
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
 
@@ -127,6 +134,7 @@ def test_the_witness_knows_the_gain():
     seen = pulse_capture(gains=np.exp(true))
     found = witness(seen, fit)
     assert found["wall_gain_correlation"] == pytest.approx(1, abs=1e-3)
+    assert found["wall_gain_by_chance"] == pytest.approx(1, abs=1e-3), "it looks alike from all sides"
     assert found["direct_pulse_counts"] == pytest.approx(seen.counts[:, :160].sum() / 64)
     assert found["tail_decay_fitted_m"] == pytest.approx(0.2, rel=1e-3)
     assert found["tail_decay_direct_m"] == direct_decays(seen)
@@ -144,6 +152,22 @@ def test_the_witness_knows_the_gain():
     assert witness(pulse_capture(gains=mixed), fit)["wall_gain_correlation"] == pytest.approx(
         by_hand, abs=1e-4
     )
+
+
+@pytest.mark.parametrize("columns", [5, 4])
+def test_chance_is_what_turned_and_mirrored_maps_share(columns):
+    """Seven other ways to lay a square on itself, three for a rectangle; the sign does not count."""
+    rng = np.random.default_rng(2)
+    one, other = rng.standard_normal((2, 5, columns))
+    ways = []
+    for transposed in (False, True) if columns == 5 else (False,):
+        for x in (1, -1):
+            for y in (1, -1):
+                turned = other[::x, ::y]
+                ways.append(turned.T if transposed else turned)
+    expected = [abs(np.corrcoef(one.ravel(), way.ravel())[0, 1]) for way in ways[1:]]
+    assert by_chance(one, other) == pytest.approx(max(expected))
+    assert len(expected) == (7 if columns == 5 else 3)
 
 
 def test_the_witness_knows_the_time_zero_of_single_spots():
