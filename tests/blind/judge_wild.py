@@ -18,6 +18,7 @@ from wild_truth import make
 from data_modules.readers import read_capture
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.members import Findings
 from nlos_lit.inference.result import Diagnosis
 
 
@@ -31,7 +32,11 @@ class Outcome:
         named: weights by name of each effect that was accepted, in order. unknown: axes of free terms.
         parameters: value and standard error by effect and quantity.
         base, extended, noise: deviance per bin of the untouched spots.
-        largest: term and nats of the most evidence in the first pool. error: what went wrong.
+        largest: term and nats of the most evidence in the first pool.
+        likely: terms that are told of and not named.
+        tried: of each term what was found when it was last asked for: own and needed nats, gain of the select
+            spots and its error, weight, explained share, and whether it was accepted.
+        error: what went wrong.
     """
 
     set_name: str
@@ -49,6 +54,8 @@ class Outcome:
     extended: float = 0.0
     noise: float = 0.0
     largest: tuple[str, float] = ("", 0.0)
+    likely: list[str] = field(default_factory=list)
+    tried: dict[str, list[float]] = field(default_factory=dict)
     seconds: float = 0.0
     error: str = ""
 
@@ -73,23 +80,27 @@ def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
     }
     began = time.process_time()
     try:
-        found, _ = diagnose(capture, pipeline_for(capture), options, name=path.stem, seed=0)
+        diagnosis, found = diagnose(capture, pipeline_for(capture), options, name=path.stem, seed=0)
     except Exception:  # a failure counts against the rates, and the others go on
         return Outcome(**known, error=traceback.format_exc(limit=-2), seconds=time.process_time() - began)
-    return Outcome(**known, **said(found), seconds=time.process_time() - began)
+    return Outcome(**known, **said(diagnosis, found), seconds=time.process_time() - began)
 
 
-def said(found: Diagnosis) -> dict:
+def said(diagnosis: Diagnosis, found: Findings) -> dict:
     """The fields of an outcome that a diagnosis fills."""
-    test = found.untouched_test
+    test, effects = diagnosis.untouched_test, diagnosis.effects
+    asked = {m.name: (m.confirmed, m.accepted) for m in found.members if m.confirmed}
     return {
-        "named": [{n: round(w, 3) for n, w in (e.weights or {e.name: 1.0}).items()} for e in found.effects],
-        "unknown": [e.axis for e in found.unknown],
-        "parameters": {
-            e.name: {n: [p.value, p.stderr] for n, p in e.parameters.items()} for e in found.effects
-        },
+        "named": [{n: round(w, 3) for n, w in (e.weights or {e.name: 1.0}).items()} for e in effects],
+        "unknown": [e.axis for e in diagnosis.unknown],
+        "parameters": {e.name: {n: [p.value, p.stderr] for n, p in e.parameters.items()} for e in effects},
         "base": test["base"].deviance_per_bin,
         "extended": test["extended"].deviance_per_bin,
         "noise": test["extended"].deviance_noise,
-        "largest": (found.screened[0].name, found.screened[0].evidence),
+        "largest": (diagnosis.screened[0].name, diagnosis.screened[0].evidence),
+        "likely": [term.name for term in diagnosis.likely],
+        "tried": {
+            name: [c.evidence, c.needed, c.gain.nats, c.gain.error, c.weight, c.explained, float(accepted)]
+            for name, (c, accepted) in asked.items()
+        },
     }
