@@ -100,6 +100,12 @@ def first_right(row: dict) -> bool:
     return 0 < len(group) <= 2 and bool(set(group) & set(row["right"][hidden]))
 
 
+def likely_right(row: dict) -> bool:
+    """What is hidden is told of as likely."""
+    (hidden,) = row["right"]
+    return bool(set(row.get("likely", ())) & set(row["right"][hidden]))
+
+
 def wrong_names(row: dict) -> list[str]:
     """Groups that hold nothing hidden, nor a look-alike of it."""
     true = {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
@@ -147,9 +153,19 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
             interval(sum(bool(c["unknown"]) for c in by["null"]), len(by["null"])),
         ),
         (
+            "… told of as likely there",
+            "",
+            interval(sum(bool(c.get("likely")) for c in by["null"]), len(by["null"])),
+        ),
+        (
             f"named first, alone or in a group of two (projected true statistic > {CLEAR:g})",
             "≥ 95 %",
             interval(sum(map(first_right, seen)), len(seen)),
+        ),
+        (
+            "… or told of as likely",
+            "",
+            interval(sum(first_right(c) or likely_right(c) for c in seen), len(seen)),
         ),
         ("… of the fainter ones", "", interval(sum(map(first_right, faint)), len(faint))),
         (
@@ -189,6 +205,7 @@ def table(cases: list[dict]) -> str:
         "counts",
         "hidden (projected statistic)",
         "said",
+        "likely",
         "free terms",
         "base / noise",
         "after / noise",
@@ -201,8 +218,8 @@ def table(cases: list[dict]) -> str:
         noise = c["noise"] or float("nan")
         cells = (
             c["index"], c["spec"]["family"], c["spec"]["scan"], f"{c['spec']['level']:g}", hidden, said,
-            ", ".join(c["unknown"]) or "–", f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}",
-            f"{c['seconds']:.0f}",
+            ", ".join(c.get("likely", ())) or "–", ", ".join(c["unknown"]) or "–",
+            f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}", f"{c['seconds']:.0f}",
         )  # fmt: skip
         out.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(out)

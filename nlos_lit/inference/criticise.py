@@ -392,9 +392,8 @@ class Loop:
             (f"going on without {n}", f"{kept}_but_{n}", partial(self.without, scene, [n])) for n in names
         ]
         whole, *fewer = self.steps.several("fit", jobs, s.processes)
-        bar, value, found = partial(self._bar, self._misfit(scene)), log_likelihood(whole, select), []
-        asking = partial(own_evidence, scene, self.split, s.spots, self.seed, names, bar)
-        own, enough = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
+        own, bar, enough = self._own(scene, names, kept)
+        value, found = log_likelihood(whole, select), []
         for member, fit in zip(members, fewer, strict=True):
             before = log_likelihood(fit, select)
             gain, weight, explained = self._gained(fit, before, value)
@@ -405,6 +404,17 @@ class Loop:
             asked = replace(member, confirmed=confirmed, accepted=confirmed.holds, trials=trials)
             found.append((asked, fit))
         return found, enough
+
+    def _own(
+        self, scene: SurfelFit, names: list[str], kept: str
+    ) -> tuple[dict[str, tuple[float, float]], Callable[[float], float], list[str]]:
+        """Own evidence of some terms of a scene, what they need there, and who is left when all who have less
+        are gone.
+        """
+        bar = partial(self._bar, self._misfit(scene))
+        asking = partial(own_evidence, scene, self.split, self.settings.spots, self.seed, names, bar)
+        own, enough = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
+        return own, bar, enough
 
     def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """Terms with a number for each spot, which are asked last: with them nothing is predicted for others.
@@ -455,11 +465,21 @@ class Loop:
             The members, and the scene with what each is now.
         """
         settled = [self.settled(m) if m.accepted else m for m in members]
-        other = [(old.name, new) for old, new in zip(members, settled, strict=True) if old.name != new.name]
-        if other:
-            bare = self.without(scene, [name for name, _ in other])
-            scene = self.gone_on(bare, [new.candidate for _, new in other])
-        return settled, scene
+        pairs = [(old.name, new) for old, new in zip(members, settled, strict=True) if old.name != new.name]
+        if not pairs:
+            return settled, scene
+        gone, came = [name for name, _ in pairs], [new for _, new in pairs]
+        text, kept = f"going on without {', '.join(gone)}", f"bare{self.number}_{'_'.join(gone)}"
+        bare = self.steps("fit", text, kept, partial(self.without, scene, gone))
+        scene = self.gone_on(bare, [m.candidate for m in came])
+        own, bar, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
+        now = dict[str, Member]()
+        for member in came:
+            none = next(t for t in member.trials if t.candidate is None)
+            evidence, lit = own[member.name]
+            gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
+            now[member.name] = replace(member, confirmed=Confirmed(evidence, bar(lit), *gained))
+        return [now.get(m.name, m) for m in settled], scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """The same scene, gone on without all other terms.

@@ -136,7 +136,8 @@ class World:
         assert set(names) <= fit.names
         self.asked.append(names)
         found = {c.name: c for c in self.pool}
-        own = {n: (self.own.get(n, found[n].evidence), found[n].lit) for n in names}
+        own = {n: (self.own.get(n, 300.0), found[n].lit if n in found else 1.0) for n in names}
+        own |= {n: (found[n].evidence, found[n].lit) for n in names if n in found and n not in self.own}
         return own, [n for n, (nats, lit) in own.items() if nats > bar(lit)]
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
@@ -482,9 +483,11 @@ def test_a_simpler_rival_takes_the_place_of_a_term(monkeypatch):
         [candidate("irf_tail"), candidate("wall_reflectance")],
         {"wall_reflectance": ["vignetting"]},
     )
-    found = World(monkeypatch, table, pool, rivals=rivals).criticise()
+    world = World(monkeypatch, table, pool, {"vignetting": 77.0}, rivals=rivals)
+    found = world.criticise()
     assert names_of(found.accepted) == ["irf_tail", "vignetting"]
     assert found.final.names == {"irf_tail", "vignetting"}
     member = found.members[1]
     assert (member.trial.name, member.trial.gain.nats) == ("vignetting", pytest.approx(49.0))
+    assert (member.confirmed.evidence, member.confirmed.gain) == (77.0, member.trial.gain), "its own"
     assert list(member.group) == ["vignetting", "wall_reflectance"]
