@@ -3,6 +3,7 @@
     python benchmarks/blind.py run set=development first=0 number=40    diagnoses, stored as they are done
     python benchmarks/blind.py rows set=validation                   its rows into docs/blind_rows.jsonl
     python benchmarks/blind.py report                                   docs/blind.md from those rows
+    python benchmarks/blind.py sensitivity set=development commit=…     what other constants would have said
 
 Development captures may be looked at as often as one likes, validation captures when a design is finished;
 the test set is drawn and run once, when the rules are frozen (docs/blind.md).
@@ -11,6 +12,7 @@ the test set is drawn and run once, when the rules are frozen (docs/blind.md).
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import subprocess
 import sys
@@ -243,6 +245,51 @@ def report() -> None:
     page.write_text(head + MARK + "\n\n" + "\n".join(parts))
 
 
+def holding(row: dict, share: float, level: float, even: float) -> set[str]:
+    """Effects that would have what they need when they were last asked for, by other constants."""
+    from nlos_lit.effects import EFFECTS
+    from nlos_lit.effects.free_terms import FREE
+    from nlos_lit.inference.criticise import CriticismSettings
+
+    now, terms = CriticismSettings(), len(EFFECTS) + len(FREE)
+    least, changed = math.log(terms / now.level), math.log(terms / level)
+    names = {e.name for e in EFFECTS}
+    return {
+        name
+        for name, (own, needed, _, _, weight, *_) in row["tried"].items()
+        if name in names and own > changed + (needed - least) * share / now.share and weight > even
+    }
+
+
+def sensitivity(set_name: str, commit_of: str) -> None:
+    """Print how many right and wrong terms hold by other constants, of one look's rows.
+
+    Only what was tried is counted, with what was found when it was last asked for: a term that holds would
+    change what comes after it.
+    """
+    from nlos_lit.inference.criticise import CriticismSettings
+    from nlos_lit.inference.members import EVEN
+
+    every = [json.loads(text) for text in ROWS.read_text().splitlines()]
+    rows = [r for r in every if (r["set_name"], r["commit"]) == (set_name, commit_of) and "tried" in r]
+    now = CriticismSettings()
+    trials = [("share", s, (s, now.level, EVEN)) for s in (0.0, 0.02, 0.05, now.share, 0.2, 0.4)]
+    trials += [("level", v, (now.share, v, EVEN)) for v in (0.1, now.level, 0.001)]
+    trials += [("even", v, (now.share, now.level, v)) for v in (0.0, 0.2, EVEN, 0.8, 0.95)]
+    print(
+        f"{len(rows)} captures\n| constant | value | right terms | wrong ones | captures with a wrong one |"
+    )
+    print("|---|---|---|---|---|")
+    for name, value, constants in trials:
+        right = wrong = captures = 0
+        for row in rows:
+            true = {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
+            held = holding(row, *constants)
+            right, wrong = right + len(held & true), wrong + len(held - true)
+            captures += bool(held - true)
+        print(f"| `{name}` | {value:g} | {right} | {wrong} | {captures} |")
+
+
 def main(arguments: list[str]) -> None:
     what = arguments[0] if arguments else ""
     given = dict(a.split("=", 1) for a in arguments[1:])
@@ -255,6 +302,8 @@ def main(arguments: list[str]) -> None:
         keep_rows(given["set"])
     elif what == "report":
         report()
+    elif what == "sensitivity":
+        sensitivity(given.get("set", "development"), given["commit"])
     else:
         raise SystemExit(__doc__)
 
