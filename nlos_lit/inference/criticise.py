@@ -375,7 +375,7 @@ class Loop:
         ``before`` and ``value``, ``[S]`` nats, are without the term and with it.
         """
         select, gain = self.split.select, compare(before, value, self.block)
-        explained = gain.nats / max(misfit_of(without, select, len(select)), gain.nats, 1e-9)
+        explained = gain.nats / max(misfit_of(without, select, len(select)), abs(gain.nats), 1e-9)
         return gain, weights([before, value], self.block)[1], explained
 
     def _asked(
@@ -435,11 +435,17 @@ class Loop:
             if not new:
                 return members, scene
             staying = [m for m in members if m.accepted] + [Member(new[0])]
-            staying, with_it, _ = self.hold(staying, self.gone_on(scene, new[:1]))
+            with_it = self.better(self._solved(scene, new[0]), self.gone_on(scene, new[:1]))
+            staying, with_it, _ = self.hold(staying, with_it)
             if not staying[-1].accepted:
                 return [*members, staying[-1]], scene
             now = {m.name: m for m in staying}
             members, scene = [now.get(m.name, m) for m in members] + staying[-1:], with_it
+
+    def _solved(self, fit: SurfelFit, new: Candidate) -> SurfelFit:
+        """The same scene with a term of single spots, and nothing moved: batches may make it worse."""
+        text, kept = f"solving for {new.name}", f"solved{self.number}_{new.name}"
+        return self.steps("fit", text, kept, lambda: solve_spots(fit.copy(begun_with(fit, [new]), self.seed)))
 
     def predicts(self, scene: SurfelFit, other: SurfelFit) -> bool:
         """Which of two scenes predicts the select spots better.

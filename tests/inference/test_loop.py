@@ -58,12 +58,13 @@ class FakeFit:
 
     def __init__(self, extension: Extension, seed: int = 0, fine: bool = False, anew: bool = False) -> None:
         self.extension, self.seed, self.fine, self.anew = extension, seed, fine, anew
+        self.on = False  # batches have moved it
 
     def copy(self, extension: Extension, seed: int) -> FakeFit:
         return FakeFit(extension, seed, self.fine)
 
     def run(self, *_: object, **__: object) -> None:
-        pass
+        self.on = True
 
     @property
     def names(self) -> frozenset[str]:
@@ -79,7 +80,8 @@ class World:
 
     Args:
         table: nats of the select spots by names of effects; "fine" counts for a fine scene on top, "anew" for
-            one from new seeds, and a sum of names in this order may have an entry of its own.
+            one from new seeds, "on" for one that was gone on with, and a sum of names in this order may have an
+            entry of its own.
         pool: all that is ever found; what has the evidence it needs is asked for together.
         own: evidence of terms in the model; that of the pool where nothing is said.
         beside: terms that show only where all of some others are in the model.
@@ -115,9 +117,10 @@ class World:
     def likelihood(self, fit: FakeFit, spots: np.ndarray) -> Tensor:
         assert np.array_equal(spots, SPLIT.select)
         names = [*["fine"] * fit.fine, *["anew"] * fit.anew, *sorted(fit.names)]
+        on = self.table.get("on", NOTHING) if fit.on else NOTHING
         if "+".join(names) in self.table:
-            return self.table["+".join(names)]
-        return sum((self.table[n] for n in names if n in self.table), NOTHING)
+            return on + self.table["+".join(names)]
+        return sum((self.table[n] for n in names if n in self.table), on)
 
     def ask(
         self, fit: FakeFit, split, scan, most, seed, least: float, room: int, effects: bool, only
@@ -456,6 +459,21 @@ def test_what_single_spots_explain_is_asked_last(monkeypatch):
     found = World(monkeypatch, table, pool).criticise()
     assert names_of(found.accepted) == ["wall_reflectance", "irf_tail"], "hot spots add nothing to these"
     assert found.final.names == {"wall_reflectance", "irf_tail"}
+
+
+@pytest.mark.parametrize(("batches", "moved"), [(-50.0, False), (5.0, True)])
+def test_single_spots_need_no_scene_that_moves(monkeypatch, batches, moved):
+    """Batches may make a fine scene worse by more than single spots gain, which are solved for."""
+    table = {"timing_jitter": nats(30.0), "on": nats(batches)}
+    found = World(monkeypatch, table, [candidate("timing_jitter")]).criticise()
+    assert (names_of(found.accepted), found.final.on) == (["timing_jitter"], moved)
+    assert found.members[0].confirmed.gain.nats == pytest.approx(30.0), "both gone on with"
+
+
+def test_less_than_nothing_is_a_share_of_itself(monkeypatch):
+    """Where a scene without a term is at the noise already, and better than with it: minus one."""
+    world = World(monkeypatch, {"irf_tail": nats(-3.0)}, [candidate("irf_tail")], misfit=-5.0)
+    assert world.hold("irf_tail")[0]["irf_tail"].confirmed.explained == pytest.approx(-1.0)
 
 
 def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
