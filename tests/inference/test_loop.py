@@ -80,7 +80,7 @@ class World:
 
     Args:
         table: nats of the select spots by names of effects; "fine" counts for a fine scene on top, "anew" for
-            one from new seeds, "on" for one that was gone on with, and a sum of names in this order may have an
+            one from new seeds, "on" for one that was gone on with; a sum of names in this order may have an
             entry of its own.
         pool: all that is ever found; what has the evidence it needs is asked for together.
         own: evidence of terms in the model; that of the pool where nothing is said.
