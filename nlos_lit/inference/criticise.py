@@ -307,7 +307,7 @@ class Loop:
             failing = [m for m in staying if not m.accepted]
             if not failing:
                 break
-            gone = [m for m in staying if m.name not in enough]
+            gone = [m for m in failing if m.name not in enough]
             gone = gone or [min(failing, key=_gain)]
             left |= {m.name: m for m in gone}
             staying = [m for m in staying if m not in gone]
@@ -362,7 +362,7 @@ class Loop:
             now = replace(
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
-            found.append(replace(member, confirmed=now, accepted=now.holds))
+            found.append(replace(member, confirmed=now, accepted=now.holds(member.free)))
         return found
 
     def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
@@ -401,7 +401,8 @@ class Loop:
             confirmed = Confirmed(evidence, bar(lit), gain, weight, explained)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
-            asked = replace(member, confirmed=confirmed, accepted=confirmed.holds, trials=trials)
+            holds = confirmed.holds(member.free)
+            asked = replace(member, confirmed=confirmed, accepted=holds, trials=trials)
             found.append((asked, fit))
         return found, enough
 

@@ -13,8 +13,9 @@ from nlos_lit.inference.heldout import Comparison, weights
 from nlos_lit.inference.pool import MOST, Candidate, Pool
 from nlos_lit.surfels.fit import SurfelFit
 
-MUCH = 0.25  # of what select spots leave unexplained without a term: if it explains more, that is told …
-SURE = 0.95  # … where it has this weight
+# Of what select spots leave unexplained without a term. A free term that explains more, with this weight,
+# holds, since it claims no cause; an effect is told of.
+MUCH, SURE = 0.25, 0.95
 EVEN = 0.5  # weight from which on a scene predicts better rather than worse than another
 
 
@@ -61,9 +62,18 @@ class Confirmed:
     explained: float = 0.0
 
     @property
-    def holds(self) -> bool:
-        """By its own evidence, which other spots do not contradict."""
-        return self.evidence > self.needed and self.weight > EVEN
+    def much(self) -> bool:
+        """Spots that were not fitted are predicted much better with it."""
+        return self.explained > MUCH and self.weight > SURE
+
+    def holds(self, free: bool) -> bool:
+        """By its own evidence, which other spots do not contradict.
+
+        Args:
+            free: the term is one. A misfit of the scene may look like it as like any, but it is no name: what
+                it predicts is enough.
+        """
+        return self.weight > EVEN and (self.evidence > self.needed or (free and self.much))
 
 
 @dataclass(frozen=True)
@@ -92,10 +102,14 @@ class Member:
         return self.candidate.name
 
     @property
+    def free(self) -> bool:
+        """Its term is a free one."""
+        return self.name in FREE_NAMES
+
+    @property
     def likely(self) -> bool:
         """It does not hold, although spots that were not fitted are predicted much better with it."""
-        found = self.confirmed
-        return not self.accepted and found is not None and found.explained > MUCH and found.weight > SURE
+        return not self.accepted and self.confirmed is not None and self.confirmed.much
 
     @property
     def trial(self) -> Trial:

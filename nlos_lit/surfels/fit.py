@@ -223,6 +223,7 @@ class SurfelFit:
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
         self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
+        self.lays = False  # one round more begins with sheets laid anew
         self.undo: dict[str, Any] | None = None  # what a trial began with
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []

@@ -91,8 +91,10 @@ def test_a_fit_goes_on_to_the_same_digits(tmp_path):
     )
     extension.effects[1].requires_grad_(False)
     fit = fit_of(model, drawn(model, extension, scene), extension)
+    shared = {"capture": fit.capture, "counts": fit.counts, "settings": fit.settings}
+    same(fit, kept(fit, scan, tmp_path, **shared))  # before anything is done
     fit.run(1, steps=2)
-    again = kept(fit, scan, tmp_path, capture=fit.capture, counts=fit.counts, settings=fit.settings)
+    again = kept(fit, scan, tmp_path, **shared)
     same(fit, again)
     assert again.capture is fit.capture
     assert again.counts is fit.counts

@@ -375,6 +375,19 @@ def test_what_is_predicted_much_better_is_told(monkeypatch, gain, told):
     assert not replace(found["irf_tail"], confirmed=open_).likely
 
 
+@pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
+def test_a_free_term_holds_by_what_it_predicts(monkeypatch, gain, accepted):
+    """It is no name. Beside an effect of the same kind that is told of; and not with a weight of 94 %."""
+    table = {"free_time": nats(gain), "irf_tail": nats(gain)}
+    world = World(monkeypatch, table, [candidate(n) for n in table], dict.fromkeys(table, 1.0), misfit=100.0)
+    found, scene = world.hold("free_time")
+    assert (found["free_time"].accepted, found["free_time"].likely) == (accepted, False)
+    assert scene.names == ({"free_time"} if accepted else set())
+    found, scene = world.hold("irf_tail", "free_time")
+    assert {n: m.accepted for n, m in found.items()} == {"irf_tail": False, "free_time": accepted}
+    assert not replace(found["free_time"].confirmed, weight=0.94).holds(free=True)
+
+
 def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):
     """Neither is missed beside the other; without the one that gains less the other is."""
     for pair, stays in ((("irf_tail", "afterpulsing"), "irf_tail"), (("free_time", "irf_tail"), "free_time")):
