@@ -67,6 +67,11 @@ def confidence(diagnosis: Diagnosis) -> str:
     if any(rivals(diagnosis, term) for term in terms):
         first = "Open: that something is there is " + ("well supported" if held else "likely")
         text = f"{first}, but what it is this capture cannot tell: more than one cause would look like this."
+    elif any(term.needed is not None and term.evidence <= term.needed for term in terms):
+        text = (
+            f"Fair: parts of the wall that nothing was fitted to are predicted much better with {it}, but a "
+            "scene that the fitted surface cannot follow might look so, too."
+        )
     elif held:
         text = f"Good: {asked}, and {it} also predicts parts of the wall that nothing was fitted to."
     else:

@@ -29,6 +29,8 @@ def test_confidence_is_said_in_words():
     )
     shaky = dataclasses.replace(TILT, heldout_gain=Gain(1.2, 1.19, 0.001, (-0.001, 0.003)))
     assert confidence(diagnosis(effects=[shaky])).startswith("Fair: ")
+    little = dataclasses.replace(TAIL_ALONE, needed=TAIL_ALONE.evidence)
+    assert "might look so, too" in confidence(two_found(effects=[little], groups=[]))
     assert confidence(CASES["nothing"]).startswith("Good, within limits: ")
     limited = diagnosis(base=ABOVE, untouched_test={})
     assert confidence(limited).startswith("Limited: the simulation is 10 %")
