@@ -276,10 +276,10 @@ def sensitivity(set_name: str, commit_of: str) -> None:
     trials = [("share", s, (s, now.level, EVEN)) for s in (0.0, 0.02, 0.05, now.share, 0.2, 0.4)]
     trials += [("level", v, (now.share, v, EVEN)) for v in (0.1, now.level, 0.001)]
     trials += [("even", v, (now.share, now.level, v)) for v in (0.0, 0.2, EVEN, 0.8, 0.95)]
+    print(f"{len(rows)} captures\n")
     print(
-        f"{len(rows)} captures\n| constant | value | right terms | wrong ones | captures with a wrong one |"
+        "| constant | value | right terms | wrong ones | captures with a wrong one |\n|---|---|---|---|---|"
     )
-    print("|---|---|---|---|---|")
     for name, value, constants in trials:
         right = wrong = captures = 0
         for row in rows:

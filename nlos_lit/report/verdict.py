@@ -105,8 +105,20 @@ def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
         listed: say each of several things; else they are only counted.
 
     Returns:
-        What is missing, whether something else is wrong, and how much of the misfit all that explains.
+        What is missing, whether something else is wrong, how much of the misfit all that explains, and what
+        is likely besides.
     """
+    said = _found(diagnosis, listed)
+    if diagnosis.likely and (diagnosis.effects or diagnosis.unknown):
+        first = diagnosis.likely[0]
+        return (
+            f"{said} Likely besides, and not certain: {describe(first.name).phrase},"
+            f" {percent(first.explained)} of what is left elsewhere on the wall."
+        )
+    return said
+
+
+def _found(diagnosis: Diagnosis, listed: bool) -> str:
     found, share = missing(diagnosis), misfit(diagnosis).share
     said = "" if share is None else f"{percent(min(share, 1.0))} of the excess misfit"
     if not found:
