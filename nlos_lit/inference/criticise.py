@@ -290,9 +290,9 @@ class Loop:
         Args:
             members: whose terms the scene has.
             scene: with all of them.
-            coarse: the parsimonious scene with all of them, where it is to be asked; then also
-            before: terms that held before these came, and are not asked again. Where none of these holds all
-                is as it was.
+            coarse: the parsimonious scene with all of them, where it is to be asked.
+            before: what held before these came, where ``coarse`` is given. It is not asked again, and where
+                none of these holds all is as it was.
 
         Returns:
             The same members, accepted or not, with none and itself as trials where they are, and both scenes
