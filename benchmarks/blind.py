@@ -108,9 +108,14 @@ def likely_right(row: dict) -> bool:
     return bool(set(row.get("likely", ())) & set(row["right"][hidden]))
 
 
+def true_names(row: dict) -> set[str]:
+    """Of what is hidden, and its look-alikes."""
+    return {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
+
+
 def wrong_names(row: dict) -> list[str]:
     """Groups that hold nothing hidden, nor a look-alike of it."""
-    true = {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
+    true = true_names(row)
     return ["/".join(group) for group in row["named"] if not set(group) & true]
 
 
@@ -283,8 +288,7 @@ def sensitivity(set_name: str, commit_of: str) -> None:
     for name, value, constants in trials:
         right = wrong = captures = 0
         for row in rows:
-            true = {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
-            held = holding(row, *constants)
+            true, held = true_names(row), holding(row, *constants)
             right, wrong = right + len(held & true), wrong + len(held - true)
             captures += bool(held - true)
         print(f"| `{name}` | {value:g} | {right} | {wrong} | {captures} |")

@@ -340,8 +340,7 @@ class Loop:
         names = [m.name for m in gone]
         if len(gone) == 1:
             return next(fit for member, fit in asked if member.name == names[0])
-        text, kept = f"going on without {', '.join(names)}", f"left{self.number}_{'_'.join(names)}"
-        return self.steps("fit", text, kept, partial(self.without, scene, names))
+        return self._parted(scene, names, f"left{self.number}_{'_'.join(names)}")
 
     def _anew(self, members: list[Member], coarse: SurfelFit) -> list[Member]:
         """Members that hold, asked against parsimonious scenes that were built without them.
@@ -362,7 +361,7 @@ class Loop:
             now = replace(
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
-            found.append(replace(member, confirmed=now, accepted=now.holds(member.free)))
+            found.append(replace(member, confirmed=now, accepted=now.holds(member.candidate.free)))
         return found
 
     def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
@@ -401,7 +400,7 @@ class Loop:
             confirmed = Confirmed(evidence, bar(lit), gain, weight, explained)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
-            holds = confirmed.holds(member.free)
+            holds = confirmed.holds(member.candidate.free)
             asked = replace(member, confirmed=confirmed, accepted=holds, trials=trials)
             found.append((asked, fit))
         return found, enough
@@ -476,8 +475,7 @@ class Loop:
         if not pairs:
             return settled, scene
         gone, came = [name for name, _ in pairs], [new for _, new in pairs]
-        text, kept = f"going on without {', '.join(gone)}", f"bare{self.number}_{'_'.join(gone)}"
-        bare = self.steps("fit", text, kept, partial(self.without, scene, gone))
+        bare = self._parted(scene, gone, f"bare{self.number}_{'_'.join(gone)}")
         scene = self.gone_on(bare, [m.candidate for m in came])
         own, bar, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
         now = dict[str, Member]()
@@ -501,8 +499,13 @@ class Loop:
         others = [e.name for e in fit.extension.effects if e.name not in names]
         if not others:
             return fit
-        text, kept = f"going on without {', '.join(others)}", f"only{self.number}_{'_'.join(names)}"
-        return self.steps("fit", text, kept, partial(self.without, fit, others))
+        return self._parted(fit, others, f"only{self.number}_{'_'.join(names)}")
+
+    def _parted(self, fit: SurfelFit, names: list[str], kept: str) -> SurfelFit:
+        """:meth:`without` as a step of its own, kept as ``kept``."""
+        return self.steps(
+            "fit", f"going on without {', '.join(names)}", kept, partial(self.without, fit, names)
+        )
 
     def needed(self, fit: SurfelFit) -> float:
         """Nats of own evidence that a term needs beside a fine scene, if it acts where its light falls."""
@@ -613,7 +616,7 @@ def criticise(
     pool = asked(effects=True)
     for free in (False, True):
         new = list[Member]()
-        while come := [Member(t.candidate, t.rivals) for t in pool.together if t.free == free]:
+        while come := [Member(t.candidate, t.rivals) for t in pool.together if t.candidate.free == free]:
             coarse = loop.joined(coarse, [m.candidate for m in come])
             new, found.members = new + come, found.members + come
             told(first, coarse, found.members)

@@ -102,11 +102,6 @@ class Member:
         return self.candidate.name
 
     @property
-    def free(self) -> bool:
-        """Its term is a free one."""
-        return self.name in FREE_NAMES
-
-    @property
     def likely(self) -> bool:
         """It does not hold, although spots that were not fitted are predicted much better with it."""
         return not self.accepted and self.confirmed is not None and self.confirmed.much

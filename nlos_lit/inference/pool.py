@@ -72,6 +72,11 @@ class Candidate:
     def name(self) -> str:
         return self.effect.name
 
+    @property
+    def free(self) -> bool:
+        """It is a free term."""
+        return self.name in FREE_NAMES
+
 
 @dataclass(frozen=True)
 class Taken:
@@ -85,11 +90,6 @@ class Taken:
 
     candidate: Candidate
     rivals: list[Candidate]
-
-    @property
-    def free(self) -> bool:
-        """It is a free term."""
-        return self.candidate.name in FREE_NAMES
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def together(
         return found
 
     for free in (False, True) if effects else (True,):
-        asked = [] if taken else [c for c in loud if (c.name in FREE_NAMES) == free]
+        asked = [] if taken else [c for c in loud if c.free == free]
         for c in asked:
             raw[c.name] = weighted_columns(problem, c.effect)
             freed[c.name] = projector.free(raw[c.name])

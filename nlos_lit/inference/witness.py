@@ -47,12 +47,12 @@ def witness(capture: Capture, fit: SurfelFit) -> dict[str, Any] | None:
     }
     gain = log_gain(fit, capture.n_spots)
     if gain is not None:
-        found["wall_gain_correlation"] = float(np.corrcoef(gain, np.log(before.clip(1)))[0, 1])
+        energy = np.log(before.clip(1))
+        found["wall_gain_correlation"] = float(np.corrcoef(gain, energy)[0, 1])
         if capture.scan_shape is not None and len(capture.scan_shape) == 2:
-            maps = {"direct": before.clip(1) / before.mean(), "fitted": np.exp(gain)}
-            shaped = {name: m.reshape(capture.scan_shape) for name, m in maps.items()}
-            found["maps"] = {name: m.tolist() for name, m in shaped.items()}
-            found["wall_gain_by_chance"] = by_chance(np.log(shaped["fitted"]), np.log(shaped["direct"]))
+            shape, maps = capture.scan_shape, {"direct": before / before.mean(), "fitted": np.exp(gain)}
+            found["maps"] = {name: m.reshape(shape).tolist() for name, m in maps.items()}
+            found["wall_gain_by_chance"] = by_chance(gain.reshape(shape), energy.reshape(shape))
     slow = [e for e in fit.extension.effects if e.witness == "tail"]
     if slow:
         first_acting = min(slow, key=lambda e: EFFECTS.index(type(e)))
