@@ -60,13 +60,19 @@ class Sheet(NamedTuple):
     normal: Tensor  # [M, 3] unit, about which surfaces lean
     first: Tensor  # [M, 3] unit, across the normal
     second: Tensor  # [M, 3] unit, across both
-    share: Tensor  # [P, 2] slopes along both, per metre that j stands out of i's plane
+    share: Tensor  # [P, 2] slopes along both, per metre that j stands out of i's plane, beyond
+    rest: Tensor  # [P] m, as far as it may while i keeps this normal
     mean: Tensor  # [P] share of j in the average about i
     own: Tensor  # [M] share of i in it
 
 
 def lay_sheet(
-    centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor], cell: float
+    centre: Tensor,
+    normal: Tensor,
+    weight: Tensor,
+    pairs: tuple[Tensor, Tensor],
+    cell: float,
+    as_it_is: bool = False,
 ) -> Sheet:
     """Planes through the neighbours of each surfel, by weighted least squares.
 
@@ -79,6 +85,7 @@ def lay_sheet(
         weight: ``[M]`` trust in each surfel.
         pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
         cell: lateral extent of a surfel, m.
+        as_it_is: normals begin as they are, and turn as those of the planes do from here on.
 
     Returns:
         what :func:`sheet_normals` and :func:`carry_along` need.
@@ -99,7 +106,8 @@ def lay_sheet(
     normal_equations = normal_equations + RIDGE * cell**2 * torch.eye(2, device=centre.device)
     share = torch.linalg.solve(normal_equations[i], trust[:, None] * along)
     total = weight.clamp_min(1e-6).index_add(0, i, trust)
-    return Sheet(pairs, normal, first, second, share, trust / total[i], weight.clamp_min(1e-6) / total)
+    rest = height if as_it_is else torch.zeros_like(height)
+    return Sheet(pairs, normal, first, second, share, rest, trust / total[i], weight.clamp_min(1e-6) / total)
 
 
 def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
@@ -154,7 +162,7 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
         [0.64, 0.0, -0.77]
     """
     i, j = sheet.pairs
-    height = ((centre[j] - centre[i]) * sheet.normal[i]).sum(1)
+    height = ((centre[j] - centre[i]) * sheet.normal[i]).sum(1) - sheet.rest
     slope = torch.zeros(len(centre), 2, device=centre.device).index_add(0, i, sheet.share * height[:, None])
     leaning = sheet.normal - slope[:, :1] * sheet.first - slope[:, 1:] * sheet.second
     return torch.nn.functional.normalize(leaning, dim=1)

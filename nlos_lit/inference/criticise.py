@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
-WARM = 120  # batches, and as many again at falling rate
+WARM = 240  # batches, at falling rates
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 
 
@@ -157,7 +157,7 @@ def go_on(fit: SurfelFit) -> SurfelFit:
         the same fit.
     """
     solve_spots(fit)
-    fit.run(1, steps=WARM, settle=False)
+    fit.go_on(WARM)
     return solve_spots(fit)
 
 

@@ -113,6 +113,8 @@ class Round:
         grow: surfels die and grow before it.
         anew: sheets are sampled once a cell before it.
         shapes: scanned parameters of effects start anew before it, where the counts ask for them.
+        onward: it goes on where a fit ended: who is whose neighbour and who hides whom stays as it is, and
+            normals begin as they are.
     """
 
     steps: int
@@ -124,6 +126,7 @@ class Round:
     contest: bool = False
     parts: int = 1
     trial: bool = False
+    onward: bool = False
 
 
 def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) -> list[Round]:
@@ -432,10 +435,18 @@ class SurfelFit:
 
         Normals follow the places of neighbours until the round ends.
         """
-        s, now = self.settings, self.plan[0]
+        now = self.plan[0]
         if now.trial:
             model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
             self.undo = copy.deepcopy({"model": model, "extension": extension})
+        if not now.onward:
+            self._arrange(now)
+        self.model.lay(as_it_is=now.onward)
+        self.optimizer = self._new_optimizer()
+
+    def _arrange(self, now: Round) -> None:
+        """Neighbours, shapes, death and growth, who hides whom."""
+        s = self.settings
         self.model.link()
         if now.shapes:
             choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
@@ -453,8 +464,6 @@ class SurfelFit:
         self.model.quadrature = (
             1 if now.contest else s.quadrature or points_along(widest, self.model.bin_length)
         )
-        self.model.lay()
-        self.optimizer = self._new_optimizer()
 
     @torch.no_grad()
     def _hide(self) -> None:
@@ -589,28 +598,17 @@ class SurfelFit:
                 self.end_round()
         return self.history[known:]
 
-    def run(
-        self,
-        rounds: int,
-        progress: Progress | None = None,
-        grow_first: bool = False,
-        steps: int | None = None,
-        settle: bool = True,
-    ) -> list[dict[str, float]]:
-        """Several rounds, the last twice as long; surfels die and grow between.
+    def go_on(self, steps: int) -> list[dict[str, float]]:
+        """Some more batches from where the fit ended, at falling rates.
 
         Args:
-            rounds: how many.
-            progress: called with (batches done, of how many).
-            grow_first: surfels die and grow before the first round, too.
-            steps: batches a round; None takes those of the settings.
-            settle: the first round comes from seeds, and the response waits for their places.
+            steps: batches.
 
         Returns:
-            one entry a round, see ``history``.
+            the entry of ``history``.
         """
-        self.schedule(rounds_of(steps or self.settings.steps, rounds, settle, grow_first))
-        return self.finish(progress)
+        self.schedule([Round(steps, onward=True)])
+        return self.finish()
 
     @torch.no_grad()
     def _deviance(self) -> tuple[float, float]:

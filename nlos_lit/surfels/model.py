@@ -207,10 +207,15 @@ class SurfelModel(nn.Module):
         self.pairs = neighbour_pairs(centre, normal, 1.6 * self.cell.max() * stretch)
 
     @torch.no_grad()
-    def lay(self) -> None:
-        """From now on normals follow from the places of neighbours, until :meth:`lift`."""
+    def lay(self, as_it_is: bool = False) -> None:
+        """From now on normals follow from the places of neighbours, until :meth:`lift`.
+
+        Args:
+            as_it_is: they begin as they are, and follow as places change.
+        """
         self.lift()
-        self.sheet = lay_sheet(*self.placed(), self.trust(), self.pairs, float(self.cell.max()))
+        cell = float(self.cell.max())
+        self.sheet = lay_sheet(*self.placed(), self.trust(), self.pairs, cell, as_it_is)
 
     @torch.no_grad()
     def lift(self) -> None:

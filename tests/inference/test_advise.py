@@ -31,7 +31,7 @@ def both(true: str, other: str, **values: float) -> tuple[SurfelFit, SurfelFit]:
     measured = drawn(surfels(scene, level=20.0), Extension([right]), scene, seed=1)
     one = fit_of(surfels(measured, level=20.0), measured, Extension([right]))
     wrong = fit_of(surfels(measured, level=20.0), measured, Extension([effect_of(other, scan)]))
-    wrong.run(1, steps=80, settle=False)
+    wrong.go_on(160)
     return one, wrong
 
 

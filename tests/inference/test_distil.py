@@ -39,7 +39,7 @@ def followed(factor: np.ndarray) -> dict[str, Follower]:
     measured = drawn(model, Extension([]), scene, seed=1, factor=by_spot)
     scan, split = Scan.of(measured), split_spots(measured)
     fit = fit_of(model, measured, Extension([effect_of("free_scan", scan)]), split.fit)
-    fit.run(1, steps=100, settle=False)
+    fit.go_on(200)
     loop = Loop(None, None, split, scan, CriticismSettings(processes=1), 0, Steps())
     value, less = (log_likelihood(f, split.select) for f in (fit, loop.without(fit, ["free_scan"])))
     return distil(loop, accepting(fit, "free_scan", compare(less, value, loop.block)))

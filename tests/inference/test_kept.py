@@ -93,15 +93,15 @@ def test_a_fit_goes_on_to_the_same_digits(tmp_path):
     fit = fit_of(model, drawn(model, extension, scene), extension)
     shared = {"capture": fit.capture, "counts": fit.counts, "settings": fit.settings}
     same(fit, kept(fit, scan, tmp_path, **shared))  # before anything is done
-    fit.run(1, steps=2)
+    fit.go_on(4)
     again = kept(fit, scan, tmp_path, **shared)
     same(fit, again)
     assert again.capture is fit.capture
     assert again.counts is fit.counts
     assert again.settings is fit.settings
     for each in (fit, again):
-        each.run(1, steps=3)
-        each.copy(Extension([]), 1).run(1, steps=2)
+        each.go_on(6)
+        each.copy(Extension([]), 1).go_on(4)
     same(fit, again)
 
 
@@ -126,7 +126,7 @@ def test_a_pool_comes_back(tmp_path):
             assert torch.allclose(getattr(new, name), getattr(old, name), rtol=0, atol=0, equal_nan=True)
         fits = [fit.copy(begun_with(fit, [c]), 0) for c in (old, new)]
         for one in fits:
-            one.run(1, steps=2)
+            one.go_on(4)
         same(*fits)
 
 

@@ -137,13 +137,13 @@ class Pipeline:
         self.seeds.append((seed, tuple(e.name for e in extension.effects), False))
         fit = fit_of(self.model, capture, extension, split.fit).copy(extension, seed)
         fit.settings = self.surfels
-        fit.run(1)
+        fit.go_on(8)
         return fit
 
     def grow(self, fit, seed) -> SurfelFit:
         self.seeds.append((seed, tuple(e.name for e in fit.extension.effects), True))
         again = fit.copy(copy.deepcopy(fit.extension), seed)
-        again.run(1)
+        again.go_on(8)
         return again
 
 

@@ -40,7 +40,7 @@ def through_a_file(fit: SurfelFit, path: Path) -> SurfelFit:
     """Another fit, from the file that this one's state leaves."""
     torch.save(fit.state(), path)
     again = begun()
-    again.run(1, steps=3)  # it was elsewhere before
+    again.go_on(6)  # it was elsewhere before
     again.restore(torch.load(path, weights_only=True))
     return again
 
@@ -65,7 +65,7 @@ def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_pa
         straight.end_round()
     assert straight.history[0]["surfels"] <= 12
     assert len(straight.history) > 3  # rounds were added
-    assert any(trial for *_, trial in tried), "no surfels were divided on trial"
+    assert any(Round(*each).trial for each in tried), "no surfels were divided on trial"
     while not stopped.finished:
         stopped = through_a_file(stopped, tmp_path / "state.pt")
         if not stopped.in_round:
@@ -78,6 +78,22 @@ def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_pa
         if stopped.round_done:
             stopped.end_round()
     assert moments == straight.done
+    assert same(stopped.state(), straight.state())
+
+
+def test_a_fit_that_goes_on_is_stopped_and_ends_where_the_other_does(tmp_path):
+    straight = begun()
+    straight.schedule([Round(4)])
+    straight.finish()
+    straight.schedule([Round(5, onward=True)])
+    stopped = through_a_file(straight, tmp_path / "state.pt")
+    straight.finish()
+    for _ in range(5):
+        if not stopped.in_round:
+            stopped.begin_round()
+        stopped.step()
+        stopped = through_a_file(stopped, tmp_path / "state.pt")
+    stopped.end_round()
     assert same(stopped.state(), straight.state())
 
 

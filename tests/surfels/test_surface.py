@@ -22,7 +22,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import brightness
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels.effect_start import choose_shapes
-from nlos_lit.surfels.fit import WORTH, Round, SurfelSettings
+from nlos_lit.surfels.fit import WORTH, Round, SurfelFit, SurfelSettings
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels, score_spots
 from nlos_lit.surfels.growth import (
     Score,
@@ -480,6 +480,46 @@ def test_normals_follow_places_while_a_sheet_is_laid(fitted):
     with torch.no_grad():
         model.raw_depth.zero_()
     assert torch.allclose(model.normal(), kept)
+
+
+def test_a_sheet_that_is_laid_as_it_is_begins_with_its_own_normals(fitted):
+    capture, result = fitted[0], fitted[-1]
+    model = flat_sheet(capture, result, tilt=0.5)
+    own = model.normal().detach()
+    model.lay()
+    assert not torch.allclose(model.normal(), own, atol=0.05)  # its neighbours know better
+    model = flat_sheet(capture, result, tilt=0.5)
+    model.lay(as_it_is=True)
+    assert torch.allclose(model.normal(), own, atol=1e-6)
+    with torch.no_grad():  # z rises by a fifth of x
+        model.raw_depth.copy_(0.2 * model.anchor[:, 0] / (model.bin_length / 2))
+    lean = -(model.normal()[:, 0] / model.normal()[:, 2])
+    assert 0.1 < lean[1] < 0.2  # beside the middle one; the ridge keeps some of what was
+    assert torch.atan(lean[4]) > 0.5 + 0.05
+
+
+def test_what_goes_on_begins_where_it_ended(fitted):
+    """At rates of nothing it stays; a round that arranges anew moves normals."""
+    capture, held, grid, result = fitted[0], fitted[1], fitted[3], fitted[-1]
+    train = torch.from_numpy(np.flatnonzero(~held))
+    counts = torch.from_numpy(capture.gated_counts())[train]
+    rates = dict.fromkeys(("depth_rate", "albedo_rate", "response_rate"), 1e-9)
+    settings, nothing = dataclasses.replace(QUICK, **rates), Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
+    model = SurfelModel.from_state(capture, result.model.state_dict())
+    model.update_visibility()
+    generator = torch.Generator().manual_seed(0)
+    given = (model, capture, grid, counts, train, settings, nothing, Extension([]), generator)
+    fit = SurfelFit(*given, torch.arange(len(train)))
+    before = fit.model.expected(train, fit.extension).detach()
+
+    def moved(plan: Round) -> float:
+        again = fit.copy(Extension([]), 0)
+        again.schedule([plan])
+        again.finish()
+        return float((again.model.expected(train, again.extension) - before).abs().max() / before.max())
+
+    assert moved(Round(2, onward=True)) < 1e-4
+    assert moved(Round(2)) > 1e-3
 
 
 def test_division_keeps_plane_area_and_albedo(fitted):
