@@ -133,7 +133,7 @@ def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
     """
     i, j = sheet.pairs
     for _ in range(AVERAGES):
-        shift = (sheet.own * shift).index_add(0, i, sheet.mean * shift[j])
+        shift = (sheet.own * shift).index_add(0, i, sheet.mean * shift.index_select(0, j))
     return shift
 
 
@@ -162,7 +162,8 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
         [0.64, 0.0, -0.77]
     """
     i, j = sheet.pairs
-    height = ((centre[j] - centre[i]) * sheet.normal[i]).sum(1) - sheet.rest
+    d = centre.index_select(0, j) - centre.index_select(0, i)
+    height = (d * sheet.normal.index_select(0, i)).sum(1) - sheet.rest
     slope = torch.zeros(len(centre), 2, device=centre.device).index_add(0, i, sheet.share * height[:, None])
     leaning = sheet.normal - slope[:, :1] * sheet.first - slope[:, 1:] * sheet.second
     return torch.nn.functional.normalize(leaning, dim=1)
@@ -183,8 +184,9 @@ def misfits(centre: Tensor, normal: Tensor, pairs: tuple[Tensor, Tensor]) -> Ten
         ``[P]`` r², differentiable.
     """
     i, j = pairs
-    d = centre[j] - centre[i]
-    mean, half = (normal[i] + normal[j]) / 2, (normal[i] - normal[j]) / 2
+    d = centre.index_select(0, j) - centre.index_select(0, i)
+    of_i, of_j = normal.index_select(0, i), normal.index_select(0, j)
+    mean, half = (of_i + of_j) / 2, (of_i - of_j) / 2
     out = (mean * d).sum(1) ** 2 / (d**2).sum(1).clamp_min(1e-12)
     return out + STIFFNESS * (half**2).sum(1)
 
@@ -213,7 +215,8 @@ def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
         tensor(0.)
     """
     i, j = pairs
-    return (weight[i] * weight[j] * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
+    trust = weight.index_select(0, i) * weight.index_select(0, j)
+    return (trust * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
 
 
 def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
@@ -236,7 +239,8 @@ def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
     """
     i, j = pairs
     level = torch.log(albedo + FAINT * albedo.detach().mean())
-    return (torch.sqrt(((level[i] - level[j]) / STEP) ** 2 + 1) - 1).sum() / 2
+    step = (level.index_select(0, i) - level.index_select(0, j)) / STEP
+    return (torch.sqrt(step**2 + 1) - 1).sum() / 2
 
 
 def brightness(albedo: Tensor) -> Tensor:

@@ -17,6 +17,11 @@ from torch import Tensor
 
 STEEP = 0.4  # cosine of the tilt up to which a patch covers its whole lateral cell
 SPLINE_VARIANCE = 1 / 3  # bins²; exact at every sub-bin phase
+EDGE = 4  # bins on either side of a record that take what is lost
+# Shares of the four bins (rows) in powers of the phase, from the zeroth on: the cubic B-spline's pieces.
+PIECES = torch.tensor([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]], dtype=torch.float64).div_(
+    6
+)
 
 
 class Paths(NamedTuple):
@@ -172,13 +177,8 @@ def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
         >>> first, 6 * weights
         (tensor(4), tensor([1., 4., 1., 0.]))
     """
-    first = torch.floor(time.detach() - 0.5)
-    f = time - 0.5 - first
-    g = 1 - f
-    weights = torch.stack(
-        [g**3 / 6, (3 * f**3 - 6 * f**2 + 4) / 6, (3 * g**3 - 6 * g**2 + 4) / 6, f**3 / 6], dim=-1
-    )
-    return first.long() - 1, weights
+    first, phase = _phase(time)
+    return first.long() - 1, _powers(phase) @ PIECES.to(time).T
 
 
 def spline_slopes(time: Tensor) -> Tensor:
@@ -190,29 +190,37 @@ def spline_slopes(time: Tensor) -> Tensor:
     Returns:
         ``[…, 4]``, 1/bin; they sum to zero.
     """
-    f = time - 0.5 - torch.floor(time.detach() - 0.5)
-    g = 1 - f
-    return torch.stack([-(g**2) / 2, (3 * f**2 - 4 * f) / 2, (4 * g - 3 * g**2) / 2, f**2 / 2], dim=-1)
+    one, f, square, _ = _powers(_phase(time)[1]).unbind(-1)
+    return torch.stack([torch.zeros_like(f), one, 2 * f, 3 * square], -1) @ PIECES.to(time).T
+
+
+def _phase(time: Tensor) -> tuple[Tensor, Tensor]:
+    """The bin whose centre is the last before an arrival, as a float, and how far after it, from 0 to 1."""
+    since = time - 0.5
+    whole = torch.floor(since.detach())
+    return whole, since - whole
+
+
+def _powers(phase: Tensor) -> Tensor:
+    """``[…, 4]`` from the zeroth to the third."""
+    return torch.stack([torch.ones_like(phase), phase, phase**2, phase**3], -1)
 
 
 class SplineSplat(torch.autograd.Function):
     """Transients ``[B, T]`` from contributions ``[B, K]`` at times ``[B, K]`` (bins) by cubic B-splines.
 
-    What leaves [0, T) is lost. Written out because autograd through the composed operations takes three times
-    as long and ten times the memory.
+    What leaves [0, T) is lost. A path's shares are polynomials of its phase, and the same polynomials for all
+    paths of a bin (``PIECES``). So powers of the phase are summed in each bin, or the transients turned into
+    the coefficients of each bin, and no path ever has four weights of its own.
     """
 
     @staticmethod
     def forward(contribution: Tensor, time: Tensor, n_bins: int) -> Tensor:
         """``[B, n_bins]`` in the unit of ``contribution``."""
-        row = torch.arange(len(time), device=time.device)[:, None] * (n_bins + 8)
-        time = time.clamp(-2.0, n_bins + 2.0)
-        first, weights = spline_weights(time)
-        flat = torch.zeros(len(time) * (n_bins + 8), dtype=contribution.dtype, device=time.device)
-        start = (first + 4 + row).reshape(-1)
-        for k in range(4):
-            flat.index_add_(0, start + k, (contribution * weights[..., k]).reshape(-1))
-        return flat.view(len(time), n_bins + 8)[:, 4 : 4 + n_bins].contiguous()
+        place, f = _located(time, n_bins)
+        first = contribution * f
+        second = first * f
+        return _from_moments([contribution, first, second, second * f], place, n_bins)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
@@ -225,68 +233,59 @@ class SplineSplat(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
         """Gradients ``[B, K]`` of contributions and times from ``[B, T]`` of the transients."""
         contribution, time = ctx.saved_tensors
-        gathered = gather_bins(grad, time)
-        _, weights = spline_weights(time)
-        return (gathered * weights).sum(-1), contribution * (gathered * spline_slopes(time)).sum(-1), None
+        value, slope = spline_at(grad, time)
+        return value, contribution * slope, None
 
     @staticmethod
     def jvp(ctx: Any, d_contribution: Tensor | None, d_time: Tensor | None, _: None) -> Tensor:
         """Change ``[B, T]`` of the transients with those of contributions and times."""
         contribution, time = ctx.saved_tensors
-        first, weights = spline_weights(time)
-        values = torch.zeros_like(weights)
-        if d_contribution is not None:
-            values = values + d_contribution[..., None] * weights
-        if d_time is not None:
-            values = values + (contribution * d_time)[..., None] * spline_slopes(time)
-        return scatter_bins(values, first, ctx.n_bins)
+        place, f = _located(time, ctx.n_bins)
+        moved = torch.zeros_like(f) if d_time is None else contribution * d_time
+        more = torch.zeros_like(f) if d_contribution is None else d_contribution
+        moments = [more, more * f + moved, (more * f + 2 * moved) * f, (more * f + 3 * moved) * f**2]
+        return _from_moments(moments, place, ctx.n_bins)
 
 
-def scatter_bins(values: Tensor, first: Tensor, n_bins: int) -> Tensor:
-    """Values added to the four bins from ``first`` on; what lies outside the record is lost.
+def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
+    """What arrivals see of transients through their shares of the bins: the transpose of splatting.
 
     Args:
-        values: ``[B, …, 4]``.
-        first: ``[B, …]`` long, first bins as of :func:`spline_weights`.
-        n_bins: bins T of the record.
-
-    Returns:
-        ``[B, T]``.
-
-    Examples:
-        >>> import torch
-        >>> scatter_bins(torch.tensor([[[1.0, 4.0, 1.0, 0.0]]]), torch.tensor([[-1]]), n_bins=3)
-        tensor([[4., 1., 0.]])
-    """
-    first = first.reshape(len(first), -1).clamp(-4, n_bins)
-    values = values.reshape(*first.shape, 4)
-    width = n_bins + 8  # four bins on either side take what is lost
-    row = torch.arange(len(first), device=first.device)[:, None] * width
-    start = (first + 4 + row).reshape(-1)
-    flat = torch.zeros(len(first) * width, dtype=values.dtype, device=values.device)
-    for k in range(4):
-        flat = flat.index_add(0, start + k, values[..., k].reshape(-1))
-    return flat.view(len(first), width)[:, 4 : 4 + n_bins].contiguous()
-
-
-def gather_bins(image: Tensor, time: Tensor) -> Tensor:
-    """Values of transients in the four bins that arrivals fill: the transpose of splatting.
-
-    Args:
-        image: ``[B, T]``.
+        image: ``[B, T]``; 0 outside the record.
         time: ``[B, K]`` in bins.
 
     Returns:
-        ``[B, K, 4]``, 0 outside the record.
+        ``[B, K]`` sums of the four bins of each arrival with its shares, and their derivatives by time.
 
     Examples:
         >>> import torch
-        >>> gather_bins(torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([[1.5]]))
-        tensor([[[1., 2., 3., 0.]]])
+        >>> value, slope = spline_at(torch.tensor([[1.0, 2.0, 3.0, 4.0]]), torch.tensor([[2.0]]))
+        >>> round(value.item(), 6), round(slope.item(), 6)  # a line is told as it is
+        (2.5, 1.0)
     """
     n_bins = image.shape[1]
-    padded = torch.nn.functional.pad(image, (4, 4)).reshape(-1)
-    first, _ = spline_weights(time.clamp(-2.0, n_bins + 2.0))
-    row = torch.arange(len(time), device=time.device)[:, None] * (n_bins + 8)
-    start = first + 4 + row
-    return torch.stack([padded[start + k] for k in range(4)], dim=-1)
+    place, f = _located(time, n_bins)
+    padded = torch.nn.functional.pad(image, (EDGE, EDGE + 3))
+    bins = torch.stack([padded[:, k : k + n_bins + 2 * EDGE].reshape(-1) for k in range(4)])
+    tables = PIECES.to(image).T @ bins
+    c0, c1, c2, c3 = (table.index_select(0, place).view(f.shape) for table in tables)
+    return c0 + f * (c1 + f * (c2 + f * c3)), c1 + f * (2 * c2 + 3 * f * c3)
+
+
+def _located(time: Tensor, n_bins: int) -> tuple[Tensor, Tensor]:
+    """Where the first of each arrival's four bins is, ``[B·K]`` among rows of ``n_bins + 2·EDGE``, and its
+    phase ``[B, K]``.
+    """
+    whole, phase = _phase(time.clamp(-2.0, n_bins + 2.0))
+    row = torch.arange(len(time), device=time.device, dtype=torch.int32)[:, None] * (n_bins + 2 * EDGE)
+    return (whole.to(torch.int32) + (row + EDGE - 1)).reshape(-1), phase
+
+
+def _from_moments(moments: list[Tensor], place: Tensor, n_bins: int) -> Tensor:
+    """Transients ``[B, T]`` from what arrives ``[B, K]``, times each power of its phase."""
+    size = len(moments[0]) * (n_bins + 2 * EDGE)
+    nothing = moments[0].new_zeros(size)
+    tables = torch.stack([nothing.index_add(0, place, m.reshape(-1)) for m in moments])
+    bins = (PIECES.to(tables) @ tables).view(4, -1, n_bins + 2 * EDGE)
+    shifted = [bins[k, :, EDGE - k : EDGE - k + n_bins] for k in range(4)]
+    return shifted[0] + shifted[1] + shifted[2] + shifted[3]

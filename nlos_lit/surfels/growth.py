@@ -25,9 +25,8 @@ from nlos_lit.functional.irf import convolve_time, response
 from nlos_lit.functional.surfel_graph import BEND, misfits
 from nlos_lit.functional.surfel_paths import (
     SPLINE_VARIANCE,
-    gather_bins,
     quadrature,
-    spline_weights,
+    spline_at,
     spread,
     trace,
 )
@@ -223,13 +222,10 @@ def score(
         energy = paths.contribution
         if visible is not None:
             energy = energy * visible[:, start : start + len(part.centre), None]
-        _, weights = spline_weights(time)
-        g = (energy * (gather_bins(pull, time) * weights).sum(-1).view(shape)).sum((0, 2))
+        g = (energy * spline_at(pull, time)[0].view(shape)).sum((0, 2))
         # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information
         # otherwise.
-        f = (energy.sum(2) * (energy * (gather_bins(weight, time) * weights).sum(-1).view(shape)).sum(2)).sum(
-            0
-        )
+        f = (energy.sum(2) * (energy * spline_at(weight, time)[0].view(shape)).sum(2)).sum(0)
         total[0, start : start + len(g)], total[1, start : start + len(g)] = g.double(), f.double()
     gain = sensor.intensity().item()
     return Score(total[0] * gain, total[1] * gain**2)
