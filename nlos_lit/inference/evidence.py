@@ -78,6 +78,14 @@ class Rows(NamedTuple):
     lit: Tensor  # [n ≤ N] share of the scene's light in each row of bins
 
 
+class Freed(NamedTuple):
+    """Columns without what the base can explain of them."""
+
+    z: Tensor  # [N + H, k] Projector.free
+    across: Tensor  # [Q, k] Projector.along of z
+    off: Tensor  # [N + H + Q, k] Projector.even of z, at the width without any term
+
+
 class Projector:
     """Takes from any columns what the base can explain by itself.
 
@@ -152,9 +160,18 @@ class Projector:
         weights = (self.axes @ (shrink[:, None] * (self.along(z) if across is None else across))).float()
         return torch.cat([z - self.uneven @ weights, -weights / variance.sqrt().float()])
 
+    def freed(self, columns: Tensor) -> Freed:
+        """``columns`` ``[N, k]`` after both steps, at the width without any term.
+
+        Each step passes over all of X, or of U, however few columns are given.
+        """
+        z = self.free(columns)
+        across = self.along(z)
+        return Freed(z, across, self.even(z, self.width, across))
+
     def off(self, columns: Tensor) -> Tensor:
         """``[N + H + Q, k]``: ``columns`` ``[N, k]`` after both steps, at the width without any term."""
-        return self.even(self.free(columns), self.width)
+        return self.freed(columns).off
 
     def residual_at(self, width: int) -> Tensor:
         """``[N + H + Q]`` residual at another width."""
@@ -322,7 +339,7 @@ def evidence(
 def best_evidence(
     projector: Projector,
     raw: Tensor,
-    z: Tensor,
+    freed: Freed,
     block: Tensor,
     deviation: Tensor,
     bounds: tuple[Tensor, Tensor] | None = None,
@@ -332,7 +349,7 @@ def best_evidence(
     Args:
         projector: of the base.
         raw: ``[S, T, k]`` weighted columns.
-        z: ``[S·T + H, k]``, the same after :meth:`Projector.free`.
+        freed: the same as :meth:`Projector.freed` leaves them.
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
@@ -340,9 +357,10 @@ def best_evidence(
     Returns:
         what the counts say of it, at the width where they say most.
     """
-    found, across = [], projector.along(z)
+    found, (z, across, known) = [], freed
     for width in sorted({projector.width, projector.width_beside(z, across, deviation)}):
-        off, level = projector.even(z, width, across), float(projector.levels[width])
+        off = known if width == projector.width else projector.even(z, width, across)
+        level = float(projector.levels[width])
         one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds)
         found.append((replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)), off))
     best, off = max(found, key=lambda pair: pair[0].nats)

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.evidence import (
     SEGMENTS,
     Evidence,
+    Freed,
     Projector,
     best_evidence,
     lit_share,
@@ -32,10 +34,10 @@ from nlos_lit.surfels.fit import SurfelFit
 
 MOST = 0.9  # of the largest evidence or gain: a simpler term with so much goes before that with the largest
 KEPT = 16  # shapes of one effect that are tested in full; the others are worth nothing beside them
-TOGETHER = 128  # columns from which on no more effects are projected along
+TOGETHER = 128  # columns from which on no more are projected along
 WORK = 5e10  # multiplications of the nuisance columns with each other, some 1 s of one core
 Shape = dict[str, float]
-Tried = tuple[Effect, list[tuple[Shape, Tensor]]]
+Of = TypeVar("Of")  # whose columns they are
 
 
 @dataclass(frozen=True)
@@ -170,7 +172,7 @@ def ask(
         seed: of their choice.
         least: nats that a term needs to be taken.
         room: for terms that are taken together.
-        effects: such may be taken.
+        effects: such are asked, too, and may be taken.
         only: names of those that are asked; None asks all.
 
     Returns:
@@ -179,7 +181,7 @@ def ask(
     problem, block = _problem(fit, split, most, seed)
     projector = Projector(problem)
     have = {e.name for e in fit.extension.effects}
-    terms = [e for e in [*EFFECTS, *FREE] if only is None or e.name in only]
+    terms = [e for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
     found = screen(problem, [e(scan) for e in terms if e.name not in have], block, projector)
     return Pool(found, together(problem, projector, block, found, least, room, effects))
 
@@ -220,11 +222,12 @@ def together(
     def beside(left: list[Candidate]) -> list[Candidate]:
         """The same terms, asked again beside those that were taken."""
         columns, precision = (torch.cat(parts, -1) for parts in zip(*known, strict=True))
-        other, found = projector.beside(columns, precision), []
-        for c in left:
-            z = other.free(freed[c.name])
-            found.append(_seen_again(c, _evidence(problem, other, c.effect, raw[c.name], z, block)))
-        return found
+        other = projector.beside(columns, precision)
+        parted = _parted(other, ((c, freed[c.name]) for c in left))
+        return [
+            _seen_again(c, _evidence(problem, other, c.effect, raw[c.name], part, block))
+            for c, _, part in parted
+        ]
 
     for free in (False, True) if effects else (True,):
         asked = [] if taken else [c for c in loud if c.free == free]
@@ -302,7 +305,7 @@ def own_evidence(
             score, information, _ = _scores(problem, beside, effect, column, at[problem.spots])
             return best_width(score, information, sparse(effect))[0] - many, _lit(problem, effect, column)
         beside = whole.beside(z, precision, residual + does[name])
-        own = (columns[name][:, : len(at)], beside.free(freed[name][:, : len(at)]))
+        own = (columns[name][:, : len(at)], beside.freed(freed[name][:, : len(at)]))
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit
 
@@ -368,25 +371,20 @@ def screen(
     projector = projector or Projector(problem)
     effects = [copy.deepcopy(e) for e in effects]
     found = [_per_spot(problem, projector, e) for e in effects if e.per_spot]
-    others = (e for e in effects if not e.per_spot)
-    for group in _groups((e, _worthwhile(problem, projector, e)) for e in others):
-        z = projector.free(torch.cat([columns for _, kept in group for _, columns in kept], 1))
-        start = 0
-        for effect, kept in group:
-            tried = []
-            for shape, columns in kept:
-                part = z[:, start : start + columns.shape[1]]
-                start += columns.shape[1]
-                tried.append((shape, _evidence(problem, projector, effect, columns, part, block)))
-            found.append(_candidate(effect, tried))
+    others = [e for e in effects if not e.per_spot]
+    tried: dict[str, list[tuple[Shape, Evidence]]] = {e.name: [] for e in others}
+    each = (((e, shape), columns) for e in others for shape, columns in _worthwhile(problem, projector, e))
+    for (effect, shape), columns, part in _parted(projector, each):
+        tried[effect.name].append((shape, _evidence(problem, projector, effect, columns, part, block)))
+    found += [_candidate(e, tried[e.name]) for e in others]
     return sorted(found, key=lambda c: -c.evidence)
 
 
 def _evidence(
-    problem: Problem, projector: Projector, effect: Effect, columns: Tensor, z: Tensor, block: Tensor
+    problem: Problem, projector: Projector, effect: Effect, columns: Tensor, freed: Freed, block: Tensor
 ) -> Evidence:
     raw = columns.reshape(*problem.expected.shape, -1)
-    return best_evidence(projector, raw, z, block, prior_deviations(effect), step_bounds(effect))
+    return best_evidence(projector, raw, freed, block, prior_deviations(effect), step_bounds(effect))
 
 
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:
@@ -422,20 +420,27 @@ def mean_factor(nats: list[float], number: int) -> float:
     return float(torch.logsumexp(torch.tensor(nats, dtype=torch.float64), 0)) - math.log(number)
 
 
-def _groups(tried: Iterable[Tried]) -> Iterator[list[Tried]]:
-    """Terms whose columns are projected together.
+def _parted(projector: Projector, terms: Iterable[tuple[Of, Tensor]]) -> Iterator[tuple[Of, Tensor, Freed]]:
+    """Whose columns, these, and what the base leaves of them; so many are projected together as allowed.
 
     A projection passes over all nuisance columns, however few it projects.
     """
-    group, width = [], 0
-    for effect, kept in tried:
-        group.append((effect, kept))
-        width += sum(columns.shape[1] for _, columns in kept)
-        if width >= TOGETHER:
-            yield group
-            group, width = [], 0
+    group: list[tuple[Of, Tensor]] = []
+
+    def projected() -> Iterator[tuple[Of, Tensor, Freed]]:
+        freed, start = projector.freed(torch.cat([columns for _, columns in group], 1)), 0
+        for of, columns in group:
+            part = slice(start, start + columns.shape[1])
+            yield of, columns, Freed(*(each[:, part] for each in freed))
+            start = part.stop
+
+    for term in terms:
+        group.append(term)
+        if sum(columns.shape[1] for _, columns in group) >= TOGETHER:
+            yield from projected()
+            group = []
     if group:
-        yield group
+        yield from projected()
 
 
 def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[tuple[Shape, Tensor]]:

@@ -35,6 +35,7 @@ from nlos_lit.surfels.model import SurfelModel
 # sides are not known exactly.
 PATCHES = 32
 CHUNK = 1 << 25  # elements of a batch's columns
+BATCH = 1 << 19  # … of a batch's transients
 
 
 @dataclass
@@ -173,7 +174,8 @@ def effect_columns(
         (f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted
     ]
     parts = []
-    size = _path_batch(model) if effect.needs_paths or transients is None else 256
+    by_paths = effect.needs_paths or transients is None
+    size = _path_batch(model) if by_paths else max(1, BATCH // model.n_bins)
     for start in range(0, len(spots), size):
         part = spots[start : start + size]
         forward = _staged(

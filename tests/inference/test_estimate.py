@@ -329,7 +329,7 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
         at = getattr(effect, f"raw_{effect.amplitudes[0].name}").detach()
         projector = Projector(dataclasses.replace(problem, residual=problem.residual + z @ at))
         own = (prior_deviations(effect), step_bounds(effect))
-        nats = best_evidence(projector, z.view(48, 58, -1), projector.free(z), block, *own)
+        nats = best_evidence(projector, z.view(48, 58, -1), projector.freed(z), block, *own)
         many = math.log(len(effect.shape_grid()))
         assert asked[effect.name] == (
             pytest.approx(nats.nats - many, rel=1e-3),

@@ -271,7 +271,7 @@ def test_a_term_is_held_against_a_scene_that_is_as_uneven_without_it(monkeypatch
     r = 0.15 * z[:, 0] + w @ (0.02 * normal(20, seed=3)) + normal(ROWS, seed=2)
     projector, unit = Projector(problem(r, x, uneven=w)), torch.ones(1).double()
     one = torch.zeros(SPOTS, dtype=torch.long)
-    found = best_evidence(projector, z.view(SPOTS, BINS, 1), projector.free(z), one, unit)
+    found = best_evidence(projector, z.view(SPOTS, BINS, 1), projector.freed(z), one, unit)
     assert found.scatter == 1
     alone = max(marginal(r, x, [(w, u)]) for u in UNEVENNESS)
     some = range(0, len(VARIANCES), 2)
@@ -299,7 +299,7 @@ def test_patches_that_differ_leave_no_evidence_for_what_they_share():
         each = own * normal(20, seed=3)
         r = w @ (each - each.mean() + 0.05) + normal(ROWS, seed=2)
         projector = Projector(problem(r, normal(ROWS, 5, seed=1), uneven=w))
-        found.append(best_evidence(projector, z.view(SPOTS, BINS, 1), projector.free(z), BLOCK, unit).nats)
+        found.append(best_evidence(projector, z.view(SPOTS, BINS, 1), projector.freed(z), BLOCK, unit).nats)
     assert found[0] > 4 * found[1]
     assert found[1] < 2
 
@@ -311,7 +311,7 @@ def test_a_misfit_of_the_scene_lies_where_its_light_falls():
     projector = Projector(whole)
     for z, lit in ((1 - whole.lit, 0.0), (torch.ones(ROWS), 2 / 3), (whole.lit, 1.0)):
         column = z.view(ROWS, 1)
-        found = best_evidence(projector, column.view(SPOTS, BINS, 1), projector.free(column), BLOCK, unit)
+        found = best_evidence(projector, column.view(SPOTS, BINS, 1), projector.freed(column), BLOCK, unit)
         assert found.lit == pytest.approx(lit, abs=0.03)
 
 

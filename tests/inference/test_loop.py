@@ -63,7 +63,7 @@ class FakeFit:
     def copy(self, extension: Extension, seed: int) -> FakeFit:
         return FakeFit(extension, seed, self.fine)
 
-    def run(self, *_: object, **__: object) -> None:
+    def go_on(self, *_: object, **__: object) -> None:
         self.on = True
 
     @property
