@@ -20,6 +20,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from threading import Lock
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -36,6 +38,22 @@ from nlos_lit.surfels.model import SurfelModel
 PATCHES = 32
 CHUNK = 1 << 25  # elements of a batch's columns
 BATCH = 1 << 19  # … of a batch's transients
+_dual = Lock()  # torch counts the levels of dual numbers for all threads together
+
+
+def pushed(function: Callable[..., Any], at: tuple[Tensor, ...], towards: tuple[Tensor, ...]) -> Any:
+    """Values and directional derivatives by forward mode, one thread at a time.
+
+    Args:
+        function: of as many tensors as ``at`` has.
+        at: where.
+        towards: change of each.
+
+    Returns:
+        value and derivative, of the form that ``function`` returns.
+    """
+    with _dual:
+        return torch.func.jvp(function, at, towards)
 
 
 @dataclass
@@ -232,7 +250,7 @@ def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor
     def at(v: Tensor) -> Tensor:
         return torch.func.functional_call(forward, {name: v}, ())
 
-    return torch.func.jvp(at, (value.detach(),), (tangent,))[1]
+    return pushed(at, (value.detach(),), (tangent,))[1]
 
 
 @torch.no_grad()
@@ -288,7 +306,7 @@ def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, tr
     signal = model.signal(transients, extension).repeat_interleave(t, 0)
     unit = model.signal(torch.eye(t), extension).repeat(b, 1)
     again = spots.repeat_interleave(t)
-    rows = torch.func.jvp(lambda x: model.detect(x, again, extension), (signal,), (unit,))[1]
+    rows = pushed(lambda x: model.detect(x, again, extension), (signal,), (unit,))[1]
     return rows.view(b, t, t)[:, :, model.gate[0] :].transpose(1, 2)
 
 
@@ -317,13 +335,13 @@ def _transient_columns(
 
     zero, one, still = torch.zeros_like(albedo), torch.ones_like(albedo), torch.zeros_like(centre[:, :2])
     here = (albedo, zero, still)
-    at, by_albedo = torch.func.jvp(place, here, (albedo_unit(albedo), zero, still))[:2]
+    at, by_albedo = pushed(place, here, (albedo_unit(albedo), zero, still))[:2]
     (energy, time), brighter = at, by_albedo[0]
     first, weights = spline_weights(time)
     slopes = spline_slopes(time)
 
     def moving(*tangent: Tensor) -> Tensor:
-        d_energy, d_time = torch.func.jvp(place, here, tangent)[1]
+        d_energy, d_time = pushed(place, here, tangent)[1]
         return d_energy[..., None] * weights + (energy * d_time)[..., None] * slopes
 
     blocks = [

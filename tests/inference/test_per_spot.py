@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -140,6 +141,22 @@ def test_solve_finds_every_spots_delay_and_their_width():
     assert torch.equal(found[1::2], torch.zeros(32))
     assert np.corrcoef(found[::2], delays[::2])[0, 1] > 0.99
     assert effect.width * 0.02 == pytest.approx(0.02, rel=0.35)
+
+
+def test_several_scenes_can_be_solved_at_once():
+    """Numbers of single spots come by forward mode, whose levels torch counts for all threads together."""
+    scene = capture_of(raster(8))
+    model, scan = surfels(scene, level=40.0), Scan.of(scene)
+    measured, spots = torch.from_numpy(scene.gated_counts()), torch.arange(64)
+
+    def score() -> torch.Tensor:
+        effect = effect_of("timing_jitter", scan)
+        return spot_scores(model, Extension([effect]), effect, spots, measured)[0]
+
+    alone = score()
+    with ThreadPoolExecutor(4) as pool:
+        jobs = [pool.submit(score) for _ in range(40)]
+        assert all(torch.allclose(job.result(), alone, rtol=1e-4) for job in jobs)
 
 
 def test_unseen_spots_still_say_whether_the_width_is_right():
