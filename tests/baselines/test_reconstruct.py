@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import subprocess
-import sys
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from forked import command
 
 from nlos_lit.io.volumes import read_volume
 
@@ -17,9 +16,7 @@ SMALL += ["scene.volume.depth=[0.4,0.9]", "scene.volume.depth_pitch=0.0096"]
 
 
 def reconstruct(*overrides: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "reconstruct.py", *overrides], cwd=ROOT, capture_output=True, text=True, timeout=300
-    )
+    return command("reconstruct.py", *overrides)
 
 
 def test_every_method_by_one_sweep(tmp_path):

@@ -1,4 +1,4 @@
-"""The diagnose command as a user runs it: a subprocess on a reduced scene, a finished run, and what cannot
+"""The diagnose command as a user runs it: a process on a reduced scene, a finished run, and what cannot
 work.
 """
 
@@ -8,12 +8,11 @@ import dataclasses
 import json
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ROOT
+from forked import command
 from inference_scenes import capture_of, raster
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -47,14 +46,8 @@ FIGURES = [
 ]
 
 
-def command(script: str, *overrides: str, folder: Path, check: bool = True) -> subprocess.CompletedProcess:
-    done = subprocess.run(
-        [sys.executable, f"{script}.py", *overrides, f"hydra.run.dir={folder}"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        timeout=500,
-    )
+def run(script: str, *overrides: str, folder: Path, check: bool = True) -> subprocess.CompletedProcess:
+    done = command(f"{script}.py", *overrides, f"hydra.run.dir={folder}")
     if check:
         assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     return done
@@ -67,7 +60,7 @@ def times(folder: Path) -> dict[Path, int]:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("diagnosis") / "one"
-    command("diagnose", *SCENE, *SMALL, folder=folder)
+    run("diagnose", *SCENE, *SMALL, folder=folder)
     return folder
 
 
@@ -154,8 +147,7 @@ def test_a_second_capture_is_asked_what_stays(finished, tmp_path):
             "background_slope.slope=0.8",
         ]
     )
-    words = [sys.executable, "diagnose.py", str(first), "--split-with", str(second), *SMALL]
-    done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=500)
+    done = command("diagnose.py", str(first), "--split-with", str(second), *SMALL)
     assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     said = Diagnosis.read(file)
     (further,) = said.further
@@ -169,9 +161,7 @@ def test_a_second_capture_is_asked_what_stays(finished, tmp_path):
     assert facts["status"] == "finished"
     assert any("second_scan" in sentence for sentence in facts["said"])
     assert "scene.simulate.scan.nx=24" in facts["next"]["command"]
-    again = subprocess.run(
-        [*words[:3], "--split-with", str(tmp_path / "no.mat")], cwd=ROOT, capture_output=True, text=True
-    )
+    again = command("diagnose.py", str(first), "--split-with", str(tmp_path / "no.mat"))
     assert again.returncode == 2
     assert "split_with must be a file or folder that is there" in again.stderr
 
@@ -184,14 +174,14 @@ def test_figures_are_in_tensorboard(finished):
 
 def test_a_finished_diagnosis_is_not_overwritten(finished):
     before = times(finished)
-    done = command("diagnose", *SCENE, *SMALL, folder=finished, check=False)
+    done = run("diagnose", *SCENE, *SMALL, folder=finished, check=False)
     assert done.returncode == 2
     assert "already holds a diagnosis" in done.stderr
     assert times(finished) == before
 
 
 def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
-    run = tmp_path / "run"
+    trained = tmp_path / "run"
     small = [
         "model.rays=20",
         "batch_spots=8",
@@ -200,7 +190,7 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
         "export.spots=16",
         "logger=none",
     ]
-    command(
+    run(
         "train",
         *SCENE,
         *small,
@@ -208,17 +198,17 @@ def test_a_finished_run_is_diagnosed_in_its_folder(tmp_path):
         "threads=1",
         "scene.iterations=1",
         "seed=3",
-        folder=run,
+        folder=trained,
     )
-    trained = times(run)
-    command("diagnose", *SMALL, f"run={run}", folder=tmp_path / "log")
-    said = json.loads((run / "diagnosis" / "diagnosis.json").read_text())
+    before = times(trained)
+    run("diagnose", *SMALL, f"run={trained}", folder=tmp_path / "log")
+    said = json.loads((trained / "diagnosis" / "diagnosis.json").read_text())
     assert said["capture"]["name"] == "two plates"
     assert said["capture"]["spots"] == 576
-    assert (run / "diagnosis" / "report.html").exists()
-    assert list((run / "tensorboard").glob("events.out.tfevents.*"))
-    assert {path: time for path, time in times(run).items() if path in trained} == trained
-    again = command("diagnose", *SMALL, f"run={run}", folder=tmp_path / "log", check=False)
+    assert (trained / "diagnosis" / "report.html").exists()
+    assert list((trained / "tensorboard").glob("events.out.tfevents.*"))
+    assert {path: time for path, time in times(trained).items() if path in before} == before
+    again = run("diagnose", *SMALL, f"run={trained}", folder=tmp_path / "log", check=False)
     assert again.returncode == 2
     assert "already holds a diagnosis; move" in again.stderr
 
@@ -234,7 +224,7 @@ def test_what_cannot_be_diagnosed_is_one_sentence(tmp_path):
         "scene.simulate.scan.nx=6 scene.simulate.scan.ny=6": "needs a scan of at least 16 × 16 spots",
     }
     for overrides, words in bad.items():
-        done = command("diagnose", *SMALL, *overrides.split(), folder=tmp_path / "bad", check=False)
+        done = run("diagnose", *SMALL, *overrides.split(), folder=tmp_path / "bad", check=False)
         assert done.returncode == 2, done.stderr[-2000:]
         assert "Traceback" not in done.stderr
         sentence = done.stderr.strip().splitlines()[-1]

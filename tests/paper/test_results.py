@@ -5,11 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from conftest import ROOT
+from forked import command
 
 from nlos_lit.paper.experiments import EXPERIMENTS
 
@@ -19,9 +19,7 @@ SYSTEMS = {"published system", "ours, phasor surface", "ours, refined"}
 
 
 def results(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "results.py", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=1400
-    )
+    return command("results.py", *arguments, seconds=1400)
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,8 @@ def attempt(name: str, place: Path, size: int, wait: float | None) -> tuple[str,
     output = place / "output"
     subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}k", "tmpfs", str(disk)], check=True)
     try:
-        process = multiprocessing.get_context("fork").Process(target=run, args=(COMMANDS[name](disk), output))
+        words = COMMANDS[name](disk)
+        process = multiprocessing.get_context("fork").Process(target=run, args=(words, output, output))
         process.start()
         process.join(HANG if wait is None else wait)
         if process.is_alive():

@@ -11,7 +11,6 @@ import json
 import math
 import multiprocessing
 import os
-import runpy
 import shutil
 import signal
 import sys
@@ -28,6 +27,10 @@ import torch
 from rows import add
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "tests"))
+
+from forked import run
+
 AGAIN = 6
 HANG = 300.0  # s, of work that takes some seconds
 SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM)
@@ -161,34 +164,9 @@ WORKS = (
 )  # fmt: skip
 
 
-def run(arguments: list[str], output: Path) -> None:
-    """A command in this process, which ends with it."""
-    os.setsid()
-    with output.open("w") as out:
-        os.dup2(out.fileno(), 1)
-        os.dup2(out.fileno(), 2)
-    sys.stdout, sys.stderr = (open(n, "w", buffering=1, closefd=False) for n in (1, 2))  # noqa: SIM115
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    sys.argv = list(arguments)
-    sys.path.insert(0, str(ROOT))
-    try:
-        runpy.run_path(str(ROOT / arguments[0]), run_name="__main__")
-    except SystemExit as end:
-        status = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException as error:
-        sys.excepthook(type(error), error, error.__traceback__)
-        status = 130 if isinstance(error, KeyboardInterrupt) else 1
-    else:
-        status = 0
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)
-
-
 def attempt(arguments: list[str], output: Path, wait: float, how: signal.Signals | None) -> tuple[int, bool]:
     """Run a command; the status it ended with, and whether a signal was sent."""
-    process = multiprocessing.get_context("fork").Process(target=run, args=(arguments, output))
+    process = multiprocessing.get_context("fork").Process(target=run, args=(arguments, output, output))
     process.start()
     process.join(wait)
     sent = process.is_alive() and how is not None

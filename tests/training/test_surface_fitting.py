@@ -6,14 +6,13 @@ import copy
 import json
 import shlex
 import subprocess
-import sys
 from pathlib import Path
 
 import lightning as L
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from forked import command
 from lightning.pytorch.callbacks import ModelCheckpoint
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -43,12 +42,10 @@ SMALL = [
 EFFECTS = "effects=[irf_tail,wall_reflectance]"
 
 
-def door(*overrides: str, folder: Path, code: str = "", check: bool = True) -> subprocess.CompletedProcess:
-    how = ["-c", code] if code else ["train.py"]
-    done = subprocess.run(
-        [sys.executable, *how, *SMALL, f"hydra.run.dir={folder}", *overrides],
-        cwd=ROOT, capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+def door(
+    *overrides: str, folder: Path, script: str | Path = "train.py", check: bool = True
+) -> subprocess.CompletedProcess:
+    done = command(str(script), *SMALL, f"hydra.run.dir={folder}", *overrides)
     if check:
         assert done.returncode == 0, done.stderr[-3000:] + done.stdout[-2000:]
     return done
@@ -274,7 +271,6 @@ def press(self, batch, batch_idx):
         os.kill(os.getpid(), signal.SIGINT)
     return whole(self, batch, batch_idx)
 
-signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit that it is ignored
 SurfaceFitting.training_step = press
 runpy.run_path("train.py", run_name="__main__")
 """
@@ -283,13 +279,15 @@ runpy.run_path("train.py", run_name="__main__")
 def test_an_interrupted_sequence_goes_on_in_its_second_half(tmp_path):
     sequence = ("refine=true", "scene.iterations=3", "logger=none")
     door(*sequence, folder=tmp_path / "straight")
-    done = door(*sequence, folder=tmp_path / "stopped", code=CTRL_C, check=False)
+    script = tmp_path / "stopped.py"
+    script.write_text(CTRL_C)
+    done = door(*sequence, folder=tmp_path / "stopped", script=script, check=False)
     output = done.stdout + done.stderr
     assert done.returncode == 130, output
     line = shlex.split(output.split("go on with: ")[1].splitlines()[0])
     assert line == ["python", "train.py", f"resume={tmp_path / 'stopped'}"]
     assert not (tmp_path / "stopped" / "summary.json").exists()
-    again = subprocess.run([sys.executable, *line[1:]], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    again = command(*line[1:])
     assert again.returncode == 0, again.stderr
     folders = [tmp_path / name for name in ("straight", "stopped")]
     first, second = (torch.load(f / "refined" / "surfels.pt", weights_only=True) for f in folders)
