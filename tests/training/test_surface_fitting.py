@@ -37,7 +37,7 @@ SMALL = [
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
     "trainer.check_val_every_n_epoch=5", "callbacks.checkpoint.every_n_epochs=1",
     "callbacks.figures.every=20", "surfels.contest=4", "surfels.rounds=2", "surfels.steps=8",
-    "surfels.more=1", "threads=1",
+    "surfels.more=1", "export.transients=2", "threads=1",
 ]  # fmt: skip
 EFFECTS = "effects=[irf_tail,wall_reflectance]"
 

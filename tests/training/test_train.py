@@ -31,8 +31,8 @@ SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
-    "trainer.check_val_every_n_epoch=2", "callbacks.checkpoint.every_n_epochs=1", "callbacks.figures.every=3",
-    "threads=1",
+    "trainer.check_val_every_n_epoch=2", "callbacks.checkpoint.every_n_epochs=1", "callbacks.figures.every=5",
+    "export.transients=2", "threads=1",
 ]  # fmt: skip
 
 
@@ -62,8 +62,8 @@ def finished(tmp_path_factory) -> Path:
         "scene.iterations=6",
         "effects=[wall_reflectance,irf_tail]",
         "surfels.rounds=2",
-        "surfels.steps=40",
-        "surfels.contest=20",
+        "surfels.steps=16",
+        "surfels.contest=8",
         "surfels.more=0",
         folder=folder,
     )
@@ -171,7 +171,7 @@ def test_tensorboard_events_hold_losses_parameters_and_figures(finished):
     assert wanted <= set(tags["scalars"])
     assert len(events.Scalars("loss/total")) == 6
     assert {"volume", "albedo", "transients", "kernel", "surface"} <= set(tags["images"])
-    assert len(events.Images("volume")) == 3  # before, after three iterations, at the end
+    assert len(events.Images("volume")) == 3  # before, after five iterations, at the end
 
 
 def test_a_run_folder_opens_again(finished):
@@ -257,7 +257,8 @@ def test_two_processes_give_the_single_process_result(finished, tmp_path):
 
 
 def test_the_ablation_grid_leaves_one_table(tmp_path):
-    train("-m", "ablation=glob(*)", "scene.iterations=1", "logger=none", f"hydra.sweep.dir={tmp_path}")
+    small = ("scene.iterations=1", "export.transients=1", "export.mesh_depth=5", "logger=none")
+    train("-m", "ablation=glob(*)", *small, f"hydra.sweep.dir={tmp_path}")
     with (tmp_path / "table.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["ablation"] for row in rows} == {
