@@ -11,9 +11,9 @@ STAMP := $(VENV)/.installed
 run: $(STAMP)
 	$(VENV)/bin/python train.py $(ARGS)
 
-# Two tests at a time, with a thread each.
+# Two files of tests at a time, with a thread each, the longest first (tests/conftest.py).
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile $(ARGS)
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 slow: $(STAMP)
 	$(VENV)/bin/python -m pytest -m slow $(ARGS)

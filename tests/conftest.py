@@ -21,7 +21,32 @@ WITHOUT_GPU = (
     "--disable-gpu-sandbox",
 )
 
+# Files that take longer than a quarter of a minute, the longest first.
+LONGEST = (
+    "paper/test_results.py",
+    "training/test_train.py",
+    "inference/test_diagnose.py",
+    "training/test_surface_fitting.py",
+    "blind/test_blind_screening.py",
+    "runtime/test_memory.py",
+    "surfels/test_surface.py",
+    "blind/test_blind_diagnosis.py",
+    "training/test_sharded.py",
+    "inference/test_free_terms.py",
+    "blind/test_blind_further.py",
+    "test_benchmarks.py",
+    "training/test_configs.py",
+    "baselines/test_reconstruct.py",
+    "runtime/test_steps.py",
+)
+
 torch.set_num_threads(1 if "PYTEST_XDIST_WORKER" in os.environ else 2)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that at the end no process waits long for another."""
+    place = {ROOT / "tests" / name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path, len(place)))
 
 
 def real_file(name: str) -> Path:

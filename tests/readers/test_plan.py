@@ -73,7 +73,7 @@ def composed(file, *overrides: str) -> dict:
 
 
 def test_a_scene_of_ones_own_needs_a_path_alone(file, caplog):
-    with caplog.at_level(logging.INFO):
+    with caplog.at_level(logging.INFO, "data_modules"):
         config = OmegaConf.create(composed(file))
         plan(config)
     (line,) = [r.message for r in caplog.records if r.message.startswith("plan for mine.hdf5: ")]

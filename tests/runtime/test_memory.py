@@ -51,7 +51,7 @@ import torch
 torch.set_num_threads(1)
 from table2 import measure
 from workload import Workload
-row = measure(Workload({sizes}, iterations=3), 1e9)
+row = measure(Workload({sizes}, iterations=2), 1e9)
 print(json.dumps(dict(estimate=row["estimate_bytes"], peak=row["peak_bytes"])))
 """
 SIZES = {

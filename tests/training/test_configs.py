@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import forked
 import numpy as np
 import pytest
 import torch
 from conftest import ROOT
-from forked import command
 from hydra.errors import ConfigCompositionException
 from hydra.utils import get_class
 from omegaconf import OmegaConf
@@ -365,7 +365,7 @@ def test_a_capture_of_your_own_is_called_after_its_file(path):
 def test_a_method_of_its_own_door_knows_that_name(tmp_path):
     (tmp_path / "our lab.mat").touch()
     asked = ["scene=capture", f"scene.path='{tmp_path}/our lab.mat'", "--cfg=job", "--resolve"]
-    done = command("reconstruct.py", *asked)
+    done = forked.command("reconstruct.py", *asked)
     assert "name: our_lab\n" in done.stdout, done.stderr
 
 
