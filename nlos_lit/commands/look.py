@@ -19,17 +19,10 @@ from nlos_lit.commands.plan import plan
 from nlos_lit.report.capture_figure import draw_capture
 from nlos_lit.report.fronts import View, front_views
 from nlos_lit.report.style import save_figure
-from nlos_lit.runtime.command_line import as_typed, sentence_errors, settings_as_words, typed
+from nlos_lit.runtime.command_line import sentence_errors, settings_as_words, typed
 from nlos_lit.runtime.threads import choose_threads
 from nlos_lit.training.configs import compose
 
-ABOUT = """Look at a capture file: recognise, check, plan and picture it, and say what to do next.
-
-    nlos look FILE
-    nlos look FILE scene.reader.bin_width_ps=16 out=FOLDER
-
-FILE is a capture file, or a folder of C_i, C_d, sub_Sig. Settings are those of nlos reconstruct --help. The
-pictures go to outputs/NAME/look, or to the folder that out= names."""
 METHODS = {"lct": "light-cone transform", "fk": "f-k migration", "phasor": "phasor field"}
 VOXELS = 1.5e6  # of a picture, on which the three methods take less than a minute of two cores
 DIAGNOSED = 16  # spots on a side that a diagnosis needs at least
@@ -37,9 +30,6 @@ DIAGNOSED = 16  # spots on a side that a diagnosis needs at least
 
 def main(arguments: list[str]) -> int:
     """Look at the file that ``arguments`` name, and return the exit status."""
-    if {"-h", "--help"} & set(arguments):
-        print(as_typed(ABOUT))
-        return 0
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     sentence_errors(look)(arguments)
     return 0

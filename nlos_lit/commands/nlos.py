@@ -24,6 +24,7 @@ class Command:
         does: what it does, in a line.
         example: its arguments, for the list of all commands.
         more: further paragraphs of its ``--help``.
+        help: all of its ``--help``, printed before the module is loaded; empty where it has another.
         module: of ``nlos_lit.commands``, whose ``main`` takes the arguments and returns the exit status; None
             is that of the command's own name.
         settings: its arguments are ``KEY=VALUE``, looked over before the module is loaded.
@@ -33,6 +34,7 @@ class Command:
     does: str
     example: str
     more: str = ""
+    help: str = ""
     module: str | None = None
     settings: bool = False
     paths: bool = False
@@ -44,6 +46,22 @@ class Command:
 
 
 P = ParamSpec("P")
+HELP = {"-h", "--help"}
+LOOK = """\
+Look at a capture file: recognise, check, plan and picture it, and say what to do next.
+
+    nlos look FILE
+    nlos look FILE scene.reader.bin_width_ps=16 out=FOLDER
+
+FILE is a capture file, or a folder of C_i, C_d, sub_Sig. Settings are those of nlos reconstruct --help. The
+pictures go to outputs/NAME/look, or to the folder that out= names."""
+COMPARE = """\
+Show where finished runs differ, and what came out.
+
+    nlos compare RUN RUN …
+
+RUN is the folder of a finished run. A row is a run, the best last: its folder, the settings in which it
+differs from the others, its errors. Runs that differ in the seed alone are put together below."""
 SIMULATE = """\
 Writes OUT, a y-tal HDF5 capture, and OUT's name with _truth.h5: depth, normals and albedo as seen from the
 wall, and the mesh. A scene of one's own: 'bodies=[{kind: cone, at: [0, 0, 0.6]}]'; one drawn at random:
@@ -76,6 +94,7 @@ COMMANDS = MappingProxyType(
         "look": Command(
             "look at a capture file: recognise, check, plan and picture it, and say what to do next",
             "FILE",
+            help=LOOK,
             paths=True,
         ),
         "train": Command("reconstruct a hidden scene by self-calibration", "FILE", settings=True),
@@ -97,7 +116,9 @@ COMMANDS = MappingProxyType(
         "inspect": Command(
             "print and plot what a capture file holds", "FILE", module="inspect_capture", paths=True
         ),
-        "compare": Command("show where finished runs differ, and what came out", "RUN RUN", paths=True),
+        "compare": Command(
+            "show where finished runs differ, and what came out", "RUN RUN", help=COMPARE, paths=True
+        ),
         "view": Command("open the page of a run or a diagnosis", "RUN", paths=True),
         "results": Command(
             "make the paper's tables and figures",
@@ -152,7 +173,7 @@ def main(arguments: list[str] | None = None) -> int:
     if STARTED in os.environ and os.environ.get("LOCAL_RANK", "0") != "0":
         given = [os.environ[STARTED], *given]  # Lightning starts helpers with the command's arguments alone
     name = given[0] if given else "--help"
-    if name in ("-h", "--help"):
+    if name in HELP:
         print(listed())
         return 0
     if name == "--version":
@@ -179,6 +200,11 @@ def open_command(name: str, arguments: list[str]) -> int:
         The exit status.
     """
     command = COMMANDS[name]
+    if command.help and HELP & set(arguments):
+        from nlos_lit.runtime.command_line import as_typed
+
+        print(as_typed(command.help))
+        return 0
     if command.paths and (missing := _missing(arguments)):
         what = "capture file" if command.example == "FILE" else "folder that a run has named at its end"
         print(f"error: {missing} does not exist; give a {what}", file=sys.stderr)

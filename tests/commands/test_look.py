@@ -7,7 +7,7 @@ import shlex
 import pytest
 
 from nlos_lit.capture.errors import UserError
-from nlos_lit.commands.look import VOXELS, coarser, look, main
+from nlos_lit.commands.look import VOXELS, coarser, look
 from nlos_lit.commands.simulate import simulate
 from nlos_lit.runtime.arguments import check_overrides
 from nlos_lit.runtime.command_line import words_as_settings
@@ -95,7 +95,6 @@ def test_a_file_is_needed(tmp_path):
         look(["scene.sum_bins=2"])
     with pytest.raises(UserError, match=r"no.mat does not exist; give a capture file"):
         look([str(tmp_path / "no.mat")])
-    assert main(["--help"]) == 0
 
 
 def test_a_file_with_a_sign_of_assignment_in_its_name_is_a_file(confocal, tmp_path, capsys):

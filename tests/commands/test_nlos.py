@@ -53,6 +53,20 @@ def test_a_missing_file_is_said_before_anything_is_loaded(words, wanted, capsys,
     assert f"error: nowhere.mat does not exist; give {wanted}" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["look", "--help"], "Look at a capture file: recognise, "),
+        (["compare", "-h"], "Show where finished runs differ, "),
+    ],
+)
+def test_help_is_told_before_anything_is_loaded(words, told, capsys, monkeypatch):
+    monkeypatch.delenv(STARTED, raising=False)
+    monkeypatch.setattr(nlos.importlib, "import_module", lambda name: pytest.fail("a module was loaded"))
+    assert main(words) == 0
+    assert capsys.readouterr().out.startswith(told)
+
+
 def test_processes_that_help_with_a_run_open_its_command(monkeypatch):
     opened = []
     monkeypatch.setattr(nlos, "open_command", lambda name, words: opened.append((name, words)) or 0)

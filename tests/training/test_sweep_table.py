@@ -103,8 +103,6 @@ def test_any_runs_are_compared(sweep, capsys, tmp_path):
     ]:
         assert compare(words) == 2
         assert sentence in capsys.readouterr().err
-    assert compare(["--help"]) == 0
-    assert capsys.readouterr().out.startswith("Show where finished runs differ")
 
 
 def test_runs_that_differ_in_nothing_are_told_by_their_folders(tmp_path):
