@@ -59,7 +59,7 @@ def test_commands_reach_their_programs(name, tmp_path, monkeypatch):
     for program, *words in reaching(printed(sources()[name]), tmp_path):
         command = {"inspect_capture": "inspect"}.get(program.removesuffix(".py"), program.removesuffix(".py"))
         words = words_as_settings(command, words)
-        given = [word.replace("…", "X") for word in words if not word.startswith("-")]
+        given = [word.replace("…", "X") for word in words if word != "…" and word[0] != "-"]
         if (CONF / f"{command}.yaml").exists():
             check_overrides(command, given)
         elif command in KEYS:
