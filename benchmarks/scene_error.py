@@ -50,7 +50,7 @@ def on_surface(fit, elements, parts: int):
     A round of batches follows, so that albedos, response and small errors of the cells are fitted.
     """
     from nlos_lit.effects.extension import Extension
-    from nlos_lit.surfels.fit import rounds_of
+    from nlos_lit.surfels.fit import Round
 
     again = fit.copy(Extension([]), 0)
     model = again.model
@@ -58,7 +58,7 @@ def on_surface(fit, elements, parts: int):
     model.lateral, model.cell = model.lateral._replace(pitch=(cell, cell)), model.cell / parts
     model.place(*cells_of(elements.of(elements.normal[:, 2] < -STEEP), cell))
     again.match_energy()
-    again.schedule(rounds_of(again.settings.steps, 1, settle=True))
+    again.schedule([Round(2 * again.settings.steps, settling=True)])
     again.finish()
     return again
 

@@ -12,9 +12,9 @@ RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present
 AVERAGES = 6  # over neighbours, by which a shift is carried along a sheet
 STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the places
 BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
-STEP = 0.2  # of ln(albedo): smaller differences cost little
-FAINT = 0.03  # of the mean albedo
-LEVEL = 0.75  # quantile of the albedos that is taken for the scene's own level
+EDGE = 0.3  # of the scene's level: differences of albedo beyond it are edges, and cost little more
+ALIKE = 0.05  # … below it are none, and cost next to nothing
+LEVEL = 0.75  # of the light comes from surfels no brighter than the scene's own level
 BRIGHT = 0.2  # deviation of ln(albedo) above that level
 
 
@@ -219,14 +219,38 @@ def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
     return (trust * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
 
 
-def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
-    """Cost of albedos that differ between neighbours: total variation of ln(albedo), in units of STEP.
+def level_of(albedo: Tensor) -> Tensor:
+    """The scene's own level of albedo: three quarters of its light come from no brighter surfels.
 
-    The variation is smooth within a unit. Albedos below FAINT of the mean count as equally dark.
+    However many dark surfels lie around a sheet, they send no light, and do not change it. No gradient
+    passes.
+
+    Args:
+        albedo: ``[M]`` ≥ 0.
+
+    Returns:
+        a scalar > 0.
+
+    Examples:
+        >>> import torch
+        >>> level_of(torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0])).item()
+        0.5
+    """
+    ordered = albedo.detach().sort().values
+    light = ordered.double().cumsum(0)
+    return ordered[(light < LEVEL * light[-1]).sum()].clamp_min(1e-7)
+
+
+def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor], level: Tensor) -> Tensor:
+    """Cost of albedos that differ between neighbours: ``½ Σ EDGE ln(1 + size/EDGE)`` over directed pairs.
+
+    ``size`` is the difference in units of the level, smooth about zero (``√(x² + ALIKE²) - ALIKE``). A sheet
+    is evenly bright, and ends, or changes its paint, at an edge: its cost hardly depends on its height.
 
     Args:
         albedo: ``[M]`` ≥ 0.
         pairs: i and j ``[P]`` from :func:`neighbour_pairs`, both directions.
+        level: of the scene, from :func:`level_of`.
 
     Returns:
         A scalar, differentiable.
@@ -234,33 +258,38 @@ def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
     Examples:
         >>> import torch
         >>> both = torch.tensor([0, 1]), torch.tensor([1, 0])
-        >>> albedo_steps(torch.tensor([0.4, 0.4]), both)
+        >>> one = torch.tensor(1.0)
+        >>> albedo_steps(torch.tensor([0.4, 0.4]), both, one)
         tensor(0.)
+        >>> [round(albedo_steps(torch.tensor([0.0, x]), both, one).item(), 2) for x in (0.1, 0.5, 1.0)]
+        [0.06, 0.28, 0.43]
     """
     i, j = pairs
-    level = torch.log(albedo + FAINT * albedo.detach().mean())
-    step = (level.index_select(0, i) - level.index_select(0, j)) / STEP
-    return (torch.sqrt(step**2 + 1) - 1).sum() / 2
+    step = (albedo.index_select(0, i) - albedo.index_select(0, j)) / level
+    size = torch.sqrt(step**2 + ALIKE**2) - ALIKE
+    return EDGE * torch.log1p(size / EDGE).sum() / 2
 
 
-def brightness(albedo: Tensor) -> Tensor:
+def brightness(albedo: Tensor, level: Tensor) -> Tensor:
     """Cost of albedos above the scene's own level: half a normal density of ln(albedo), of deviation BRIGHT.
 
     Light that the model has no place for gathers on surfels that few spots see, many times brighter than
     anything else.
 
     Args:
-        albedo: ``[M]`` > 0.
+        albedo: ``[M]`` ≥ 0.
+        level: of the scene, from :func:`level_of`.
 
     Returns:
-        A scalar, differentiable in the albedos; the level itself is taken as it is.
+        A scalar, differentiable in the albedos.
 
     Examples:
         >>> import torch
-        >>> brightness(torch.tensor([0.1, 0.5, 0.5, 0.5]))
+        >>> half = torch.tensor(0.5)
+        >>> brightness(torch.tensor([0.0, 0.5, 0.5, 0.5]), half)
         tensor(0.)
-        >>> round(brightness(torch.tensor([0.5, 0.5, 0.5, 0.5, 0.5 * 2.71828**0.2])).item(), 3)
+        >>> round(brightness(torch.tensor([0.5, 0.5, 0.5, 0.5 * 2.71828**0.2]), half).item(), 3)
         0.5
     """
-    over = torch.log(albedo / torch.quantile(albedo.detach(), LEVEL)).clamp_min(0)
+    over = torch.log((albedo / level).clamp_min(1.0))
     return ((over / BRIGHT) ** 2).sum() / 2

@@ -16,10 +16,8 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.split import Split
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.runtime.memory import check_machine
-from nlos_lit.surfels.fit import SurfelFit, SurfelSettings, rounds_of
+from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 from nlos_lit.surfels.fitted import fit_surfels
-
-COARSE = 3  # rounds of a parsimonious scene
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class BasePipeline:
     ) -> SurfelFit:
         """Surfels from new seeds, with the given effects.
 
-        The scene stays as parsimonious as its seeds, and what it lacks is seen in the residual.
+        No rounds follow those of the plan: what the scene lacks is seen in the residual.
 
         Args:
             capture: raw counts.
@@ -70,8 +68,7 @@ class BasePipeline:
         Returns:
             the fit, converged.
         """
-        settings = replace(self.surfels, rounds=min(COARSE, self.surfels.rounds), more=0)
-        given = (capture, *image, settings, split.fit)
+        given = (capture, *image, replace(self.surfels, more=0), split.fit)
         return fit_surfels(*given, extension=extension, seed=seed).fit
 
     def grow(self, fit: SurfelFit, seed: int) -> SurfelFit:
@@ -86,9 +83,7 @@ class BasePipeline:
         """
         again = fit.copy(copy.deepcopy(fit.extension), seed)
         again.settings = self.surfels
-        left = max(1, self.surfels.rounds - COARSE)
-        plan = rounds_of(self.surfels.steps, left, settle=False, grow_first=True)
-        again.schedule(plan, self.surfels.more, lay=True)
+        again.schedule([], self.surfels.more)
         again.finish()
         return again
 

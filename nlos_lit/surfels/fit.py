@@ -21,10 +21,12 @@ from nlos_lit.metrics.transients import transient_scores
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
+from nlos_lit.surfels.outlines import MEND, SEARCH, cut_back, extend, solve_albedos
 
 Progress = Callable[[int, int], None]
-WORTH = 0.05  # nats a parameter that another round must gain, or surfels that are divided
-PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "lays", "history", "losses")
+WORTH = 0.02  # nats a parameter that another round must gain, or surfels that are divided
+PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "finer", "history", "losses")
+FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -38,24 +40,23 @@ class SurfelSettings:
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
         max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide, and
-            half as wide as often as the counts ask for it …
-        most: … and division leaves no more surfels than this.
+        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide while
+            sheets are found, and at most two while outlines are …
+        most: … where that makes no more surfels than this.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
-        rounds: between rounds surfels die, grow and are hidden anew.
+        rounds: in which sheets are found; between them surfels die and grow one by one.
+        outlines: rounds that follow, before which sheets are extended all around and cut back.
         steps: batches a round; the last has twice as many.
-        more: last rounds that may follow, in some of which surfels are divided, see
-            :meth:`SurfelFit.schedule`.
+        more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back.
-        side_rate: in cells, of places in the surfel's own plane; 0 leaves them in the middle of their cells.
         albedo_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
         bending: weight against neighbours that do not fit one surface (:meth:`SurfelModel.bending`); 1 takes
             it for the logarithm of a prior.
-        evenness: weight against albedos that differ between neighbours (:meth:`SurfelModel.albedo_steps`).
-        brightness: weight against albedos beyond the scene's own level (:meth:`SurfelModel.brightness`).
+        evenness: weight against albedos that differ between neighbours …
+        brightness: … or are beyond the scene's own level (:meth:`SurfelModel.albedo_cost`).
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
@@ -70,17 +71,17 @@ class SurfelSettings:
     most: int = 12000
     quadrature: int | None = None
     contest: int = 150
-    rounds: int = 5
-    steps: int = 160
+    rounds: int = 3
+    outlines: int = 3
+    steps: int = 100
     more: int = 4
     batch: int = 24
     depth_rate: float = 0.15
-    side_rate: float = 0.0
     albedo_rate: float = 0.08
     response_rate: float = 0.03
     effect_rate: float = 0.1
     bending: float = 0.5
-    evenness: float = 0.5
+    evenness: float = 0.7
     brightness: float = 1.0
     surfel_cost: float = 1.5
     test_spots: int = 384
@@ -89,29 +90,27 @@ class SurfelSettings:
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
             raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
-        least = min(
-            self.contest, self.side_rate, self.bending, self.evenness, self.brightness, self.surfel_cost
-        )
+        weights = (self.bending, self.evenness, self.brightness, self.surfel_cost)
+        least = min(self.contest, self.outlines, self.more, *weights)
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
-                "surfels.floor must lie between 0 and 1, and surfels.contest, side_rate, bending, evenness, "
-                f"brightness and surfel_cost be 0 or more; found floor={self.floor} and {least}"
+                "surfels.floor must lie between 0 and 1, and surfels.contest, outlines, more, bending, "
+                f"evenness, brightness and surfel_cost be 0 or more; found floor={self.floor} and {least}"
             )
 
 
 @dataclass(frozen=True)
 class Round:
-    """One round of a fit; surfels die, grow and are hidden anew between rounds only.
+    """One round of a fit; surfels come and go and are hidden anew between rounds only.
 
     Args:
         steps: batches.
         left: rounds that follow by plan; the last one cools down.
         settling: it comes from seeds, and the response waits for their places.
         contest: surfels and response stand still; those that come out faint are left out afterwards.
-        parts: into which each side of a surfel is divided before it.
-        trial: it is undone where it gains too little.
-        grow: surfels die and grow before it.
-        anew: sheets are sampled once a cell before it.
+        parts: into which each side of a surfel is divided before it, if ``most`` surfels allow it.
+        grow: surfels die and grow before it, one by one.
+        outline: sheets are extended and cut back before it.
         shapes: scanned parameters of effects start anew before it, where the counts ask for them.
         onward: it goes on where a fit ended: who is whose neighbour and who hides whom stays as it is, and
             normals begin as they are.
@@ -120,54 +119,39 @@ class Round:
     steps: int
     left: int = 0
     settling: bool = False
-    grow: bool = False
-    anew: bool = False
-    shapes: bool = False
     contest: bool = False
     parts: int = 1
-    trial: bool = False
+    grow: bool = False
+    outline: bool = False
+    shapes: bool = False
     onward: bool = False
 
 
-def rounds_of(steps: int, count: int, settle: bool, grow_first: bool = False) -> list[Round]:
-    """A plan of rounds, the last twice as long; surfels die and grow between.
-
-    Args:
-        steps: batches a round.
-        count: how many rounds.
-        settle: the first comes from seeds.
-        grow_first: surfels die and grow before the first, too.
-
-    Returns:
-        ``count`` rounds.
-
-    Examples:
-        >>> [(each.steps, each.left, each.grow) for each in rounds_of(100, 3, settle=True)]
-        [(100, 2, False), (100, 1, True), (200, 0, True)]
-    """
-    return [
-        Round(steps if left else 2 * steps, left, settle and index == 0, grow=index > 0 or grow_first)
-        for index, left in enumerate(reversed(range(count)))
-    ]
-
-
-def plan_from_seeds(settings: SurfelSettings, parts: int, scan_shapes: bool) -> list[Round]:
+def plan_from_seeds(settings: SurfelSettings, parts: int, finer: int, scan_shapes: bool) -> list[Round]:
     """The rounds from seeds to the fitted scene, without those that may follow.
 
     Args:
         settings: of the fit.
-        parts: into which each side of a seed is divided once the seeds have contested.
+        parts: into which each side of a seed is divided once the seeds have contested, …
+        finer: … and each side of what has become of them before outlines are found.
         scan_shapes: scanned parameters of effects are started after a first round of places.
 
     Returns:
-        the plan.
+        the plan, whose last round is twice as long.
+
+    Examples:
+        >>> plan = plan_from_seeds(SurfelSettings(rounds=2, outlines=1), 1, 2, scan_shapes=False)
+        >>> [(each.steps, each.left, each.grow, each.outline) for each in plan]
+        [(150, 3, False, False), (100, 2, False, False), (100, 1, True, False), (200, 0, False, True)]
     """
-    contest = [Round(settings.contest, settings.rounds, settling=True, contest=True)]
-    count = max(settings.rounds, 2) if scan_shapes else settings.rounds
-    first, *later = rounds_of(settings.steps, count, settle=True)
-    if scan_shapes:
-        later[0] = replace(later[0], shapes=True)
-    return [*(contest if settings.contest else ()), replace(first, parts=parts), *later]
+    s = settings
+    plan = [Round(s.contest, settling=True, contest=True)] if s.contest else []
+    plan.append(Round(s.steps, settling=True, parts=parts))
+    coarse = max(s.rounds, 2) if scan_shapes else s.rounds
+    plan += [Round(s.steps, grow=True, shapes=scan_shapes and k == 0) for k in range(coarse - 1)]
+    plan += [Round(s.steps, parts=1 if k else finer, outline=True) for k in range(s.outlines)]
+    plan[-1] = replace(plan[-1], steps=2 * s.steps)
+    return [replace(each, left=len(plan) - 1 - k) for k, each in enumerate(plan)]
 
 
 class SurfelFit:
@@ -226,8 +210,8 @@ class SurfelFit:
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
         self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
-        self.lays = False  # one round more begins with sheets laid anew
-        self.undo: dict[str, Any] | None = None  # what a trial began with
+        self.undo: dict[str, Any] | None = None  # what that began with
+        self.finer = True  # surfels may be divided before one of them
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []
         self.optimizer: torch.optim.Optimizer | None = None
@@ -354,61 +338,52 @@ class SurfelFit:
         )
         sensor.set_intensity(value)
 
-    def schedule(self, plan: Sequence[Round], more: int = 0, lay: bool = False) -> None:
+    def schedule(self, plan: Sequence[Round], more: int = 0) -> None:
         """Say what is to be done next; it takes the place of what was.
 
-        Last rounds are added while the fit is above the noise and gains more than ``WORTH`` a parameter:
-        bright captures take longer to converge, and show finer detail. Every second of these rounds begins
-        with surfels divided in four, where what is unexplained could be worth that to so many parameters; it
-        is undone, and the last, where it turns out not to be. Where the fit is at the noise already, more
-        batches or finer surfels would only fit the noise.
+        Last rounds of outlines are added while the fit is above the noise: bright captures take longer to
+        converge, and show finer detail. Each must gain ``WORTH`` a parameter, or is undone. Surfels are
+        divided in four before it where what is unexplained could be worth that to so many parameters. Where
+        that was undone they stay as they are, and where a round without it was, none follows.
 
         Args:
             plan: the rounds.
             more: last rounds that may be added, at most.
-            lay: the last round of all begins with sheets laid anew: surfels that were born one after another
-                lie unevenly, and imitate noise. It is the plan's own where none may be added, else one more.
         """
         self.plan, self.more, self.before = list(plan), more, math.inf
-        self.undo, self.lays = None, lay and more > 0
-        if lay and not more:
-            self.plan[-1] = replace(self.plan[-1], anew=True)
+        self.undo, self.finer = None, self.settings.subdivide is None
         self._add_round()
 
     def _add_round(self) -> None:
-        if not self.plan and (self.more or self.undo):
-            self._go_finer()
-        if not self.plan and self.lays:
-            self.plan, self.lays = [Round(2 * self.settings.steps, grow=True, anew=True)], False
-
-    def _go_finer(self) -> None:
+        if self.plan or not (self.more or self.undo):
+            return
         deviance, noise = self._deviance()
         worth = 2 * WORTH / self.counts.numel()  # of a parameter, in deviance
-        gains = self.before - deviance >= worth * self._n_parameters()
         tried, self.undo = self.undo, None
-        if tried is not None and not gains:
+        if tried is not None and self.before - deviance < worth * self._n_parameters():
+            deviance, cells = self.before, self.model.lateral.shape
             self._take_back(tried)
-            self.more = 0
+            divided = self.model.lateral.shape != cells
+            self.finer, self.more = False, self.more if divided else 0
+        if not self.more or deviance <= noise:
             return
-        s, added = self.settings, list[Round]()
-        divisible = tried is None and s.subdivide is None and 4 * len(self.model) <= s.most
-        new = 8 * len(self.model)  # a place and an albedo of four times as many surfels
-        if self.more and deviance > noise:
-            if divisible and deviance - noise >= worth * new:
-                added = [Round(s.steps, grow=True, parts=2, trial=True)]
-            elif gains:
-                added = rounds_of(s.steps, 1, settle=False, grow_first=True)
-        self.plan, self.more, self.before = added, self.more - 1 if added else 0, deviance
+        s = self.settings
+        asked = deviance - noise >= worth * 8 * len(self.model)  # a place and an albedo of four times as many
+        wide = float(self.model.cell.max()) > FINEST * self.model.bin_length and 4 * len(self.model) <= s.most
+        self.plan = [Round(2 * s.steps, parts=2 if self.finer and asked and wide else 1, outline=True)]
+        self.more, self.before = self.more - 1, deviance
+        model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
+        self.undo = copy.deepcopy({"model": model, "extension": extension})
+
+    def _take_back(self, undo: dict[str, Any]) -> None:
+        """Surfels, response and effects as they were before a round."""
+        self.model = SurfelModel.from_state(self.capture, undo["model"])
+        self.extension.load_state_dict(undo["extension"])
+        self.to(self.counts.device)
 
     def _n_parameters(self) -> int:
         others = [*self.model.laser_sensor.parameters(), *self.extension.parameters()]
         return 2 * len(self.model) + sum(p.numel() for p in others)  # a place and an albedo each
-
-    def _take_back(self, undo: dict[str, Any]) -> None:
-        """Surfels, response and effects as they were before a trial."""
-        self.model = SurfelModel.from_state(self.capture, undo["model"])
-        self.extension.load_state_dict(undo["extension"])
-        self.to(self.counts.device)
 
     @property
     def finished(self) -> bool:
@@ -436,41 +411,45 @@ class SurfelFit:
         Normals follow the places of neighbours until the round ends.
         """
         now = self.plan[0]
-        if now.trial:
-            model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
-            self.undo = copy.deepcopy({"model": model, "extension": extension})
         if not now.onward:
             self._arrange(now)
         self.model.lay(as_it_is=now.onward)
         self.optimizer = self._new_optimizer()
 
     def _arrange(self, now: Round) -> None:
-        """Neighbours, shapes, death and growth, who hides whom."""
-        s = self.settings
+        """Neighbours, shapes, death and growth, outlines, who hides whom."""
+        s, spots, counts = self.settings, self.train[self.tested], self.counts[self.tested]
         self.model.link()
         if now.shapes:
-            choose_shapes(self.model, self.extension, self.train[self.tested], self.counts[self.tested])
+            choose_shapes(self.model, self.extension, spots, counts)
         if now.grow:
             parts = (self.capture, self.grid, self.reserve, self.counts, self.train, self.tested)
             prune_and_grow(self.model, *parts, s.surfel_cost, self.extension, self.observed)
-        if now.anew:
-            self.model.lay_anew()
-            self.match_energy()
-        if now.parts > 1:
+        if now.parts > 1 and (now.settling or now.parts**2 * len(self.model) <= s.most):
             self.model.divide(now.parts)
-        if s.visibility:
-            self._hide()
         widest = float(self.model.cell.max())
-        self.model.quadrature = (
-            1 if now.contest else s.quadrature or points_along(widest, self.model.bin_length)
-        )
+        points = s.quadrature or points_along(widest, self.model.bin_length)
+        self.model.quadrature = 1 if now.contest else points
+        self._hide(now.outline)
+        if now.outline:
+            prior = (s.evenness, s.brightness)
+            extend(self.model, self.grid, spots)
+            solve_albedos(self.model, spots, counts, *prior, SEARCH, self.extension)
+            cut_back(self.model)
+            self._hide()
+            solve_albedos(self.model, spots, counts, *prior, MEND, self.extension)
 
     @torch.no_grad()
-    def _hide(self) -> None:
+    def _hide(self, tested_only: bool = False) -> None:
         """Who hides whom, and from what albedo on: one of ``OPAQUE``, whichever makes the counts likeliest.
 
         False surfels are faint, and must not hide what is true; dark surfaces are faint, and hide.
+
+        Args:
+            tested_only: the other spots see all, until the next call.
         """
+        if not self.settings.visibility:
+            return
         counts, spots, found = self.counts[self.tested], self.train[self.tested], []
         for opaque in OPAQUE:
             self.model.opaque = opaque
@@ -478,7 +457,7 @@ class SurfelFit:
             expected = self.model.expected(spots, self.extension).clamp_min(1e-9)
             found.append((float((torch.xlogy(counts, expected) - expected).double().sum()), opaque))
         self.model.opaque = max(found)[1]
-        self.model.update_visibility()
+        self.model.update_visibility(spots if tested_only else None)
 
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""
@@ -489,7 +468,6 @@ class SurfelFit:
         response = [] if self.plan[0].contest else [*model.laser_sensor.parameters(), model.raw_passing]
         groups = [
             {"params": settled, "lr": s.depth_rate},
-            {"params": [model.raw_side] if settled and s.side_rate else [], "lr": s.side_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
             {"params": response, "lr": response_rate},
             {"params": list(self.extension.parameters()), "lr": s.effect_rate},
@@ -522,8 +500,8 @@ class SurfelFit:
             rows: ``[B]`` of the training counts.
 
         Returns:
-            ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``evenness``,
-            ``brightness``, ``sideways``, ``effects``.
+            ``loss`` and its terms: ``counts`` (Poisson, without ln k!), ``bending``, ``albedos``,
+            ``effects``.
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
@@ -531,9 +509,7 @@ class SurfelFit:
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
             "bending": s.bending * per_count * model.bending(),
-            "evenness": s.evenness * per_count * model.albedo_steps(),
-            "brightness": s.brightness * per_count * model.brightness(),
-            "sideways": per_count * model.sideways(),
+            "albedos": per_count * model.albedo_cost(s.evenness, s.brightness),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
         return {"loss": sum(terms.values(), torch.zeros(())), **terms}
@@ -575,8 +551,7 @@ class SurfelFit:
     def _drop_faint(self) -> None:
         model = self.model
         albedo = model.albedo()
-        kept = albedo > LOST * torch.quantile(albedo, 0.99)
-        model.place(model.centre()[kept], model.normal()[kept], albedo[kept])
+        model.keep(albedo > LOST * torch.quantile(albedo, 0.99))
 
     def finish(self, progress: Progress | None = None) -> list[dict[str, float]]:
         """Do all that is planned, from wherever the fit is.

@@ -263,6 +263,20 @@ def facings(places: Seeds) -> Seeds:
     return Seeds(places.centre.repeat(len(normals), 1), torch.cat(normals))
 
 
+def within_depths(places: Tensor, grid: VolumeGrid) -> Tensor:
+    """Which places lie no more than two voxels before or behind the grid.
+
+    Args:
+        places: ``[V, 3]`` m.
+        grid: of the image.
+
+    Returns:
+        ``[V]`` bool.
+    """
+    low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
+    return (places[:, 2] > low) & (places[:, 2] < high)
+
+
 def occupied(candidates: Tensor, centre: Tensor, reach: float, chunk: int = 4096) -> Tensor:
     """Which places have a surfel nearby.
 
@@ -432,22 +446,18 @@ def prune_and_grow(
     if observed is not None:  # what was not recorded asks for nothing
         seen = torch.where(observed[tested], seen, expected)
     scale = len(train) / len(tested)
-    low, high = grid.z[0] - 2 * grid.pitch[2], grid.z[-1] + 2 * grid.pitch[2]
     sensor, cell = model.laser_sensor, (float(model.cell[0]), float(model.cell[1]))
 
     def test(places: Seeds, points: int, visible: Tensor | None = None) -> Score:
         found = score(places, capture, cell, points, sensor, seen, expected, spots, hooks, visible)
         return Score(found.score * scale, found.information * scale)
 
-    def inside(places: Tensor) -> Tensor:
-        return (places[:, 2] > low) & (places[:, 2] < high)
-
     present, albedo = Seeds(*model.placed()), model.albedo()
     hidden = len(model.visible) > 0
     seen_now = model.arriving(model.visible[spots]) if hidden else None
     information = test(present, model.quadrature, seen_now)[1]
     worth = albedo.double() ** 2 * information / 2
-    kept = (worth + support(model, worth) > cost) & inside(present.centre)
+    kept = (worth + support(model, worth) > cost) & within_depths(present.centre, grid)
     if not kept.any():
         raise UserError(
             "every surfel faded away during the fit: the counts hold no third-bounce light at the image's "
@@ -459,7 +469,7 @@ def prune_and_grow(
         return test(places, 1, model.arriving(model.sees(spots, places.centre)) if hidden else None)
 
     places, source = continuations(*present, model.cell)
-    free = ~occupied(places.centre, present.centre, apart) & inside(places.centre)
+    free = ~occupied(places.centre, present.centre, apart) & within_depths(places.centre, grid)
     free &= places.normal[:, 2] < 0.2
     places, source = places.take(free), source[free]
     result = shown(places)
@@ -467,7 +477,9 @@ def prune_and_grow(
     wanted = gain > cost
     places, gain, light = places.take(wanted), gain[wanted], light[wanted]
 
-    others = facings(reserve.take(~occupied(reserve.centre, present.centre, apart) & inside(reserve.centre)))
+    others = facings(
+        reserve.take(~occupied(reserve.centre, present.centre, apart) & within_depths(reserve.centre, grid))
+    )
     result = shown(others)
     lone = result.significance.clamp_min(0) ** 2 / 2 / dispersion(result.significance)
     begun = lone > LONE

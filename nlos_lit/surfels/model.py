@@ -19,10 +19,10 @@ from nlos_lit.functional.surfel_graph import (
     brightness,
     carry_along,
     lay_sheet,
+    level_of,
     neighbour_pairs,
     sheet_normals,
 )
-from nlos_lit.functional.surfel_lattice import lay_anew
 from nlos_lit.functional.surfel_paths import (
     SPLINE_VARIANCE,
     STEEP,
@@ -38,7 +38,6 @@ from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
 OPAQUE = (0.6, 0.2, 0.05)  # of the mean albedo: surfels that are fainter than one of these hide nothing
-SIDE = 0.29  # cells: deviation of a place that is anywhere in a cell, 1/√12
 
 
 class Lateral(NamedTuple):
@@ -53,9 +52,8 @@ class SurfelModel(nn.Module):
     """Surfels with place, normal and albedo, and the laser-sensor response.
 
     Every surfel moves along one fixed ``direction``: +z, or its own normal where it stands too steeply for
-    that. "Depth" is the place along it. Besides, it moves sideways in its own plane, since at an outline, or
-    where albedo changes, the middle of a cell's light is not the cell's own. State dicts are complete:
-    :meth:`from_state` rebuilds the model with its number of surfels.
+    that. "Depth" is the place along it. State dicts are complete: :meth:`from_state` rebuilds the model with
+    its number of surfels.
 
     Args:
         capture: for its wall points and time axis; its counts are not kept.
@@ -71,7 +69,6 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
-        axes: ``[M, 2, 3]`` m, a cell's sides in the surfel's own plane.
         visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
         opaque: share of the mean albedo below which surfels hide nothing.
         observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
@@ -86,7 +83,6 @@ class SurfelModel(nn.Module):
     cell: Tensor
     anchor: Tensor
     direction: Tensor
-    axes: Tensor
     visible: Tensor
     observed: Tensor
     pairs: tuple[Tensor, Tensor]
@@ -138,18 +134,22 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
-        self.register_buffer("axes", spread(normal, self.cell.to(normal), torch.eye(2).to(normal))[0])
         self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
         self.raw_shift = nn.Parameter(torch.zeros(len(centre), device=device))  # neighbours come along
-        self.raw_side = nn.Parameter(torch.zeros(len(centre), 2, device=device))  # cells
         self.raw_normal = nn.Parameter(normal)
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
         )
         self.sheet = None
         self.link()
+
+    @torch.no_grad()
+    def keep(self, which: Tensor) -> None:
+        """Leave out all surfels but those of ``which`` ``[M]`` bool; they see every spot, as after place."""
+        centre, normal = self.placed()
+        self.place(centre[which], normal[which], self.albedo()[which])
 
     @torch.no_grad()
     def divide(self, parts: int) -> None:
@@ -163,18 +163,11 @@ class SurfelModel(nn.Module):
         self.lateral, self.cell = Lateral((x, y), finer, (nx * parts, ny * parts)), self.cell / parts
         self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in (normal, self.albedo())))
 
-    @torch.no_grad()
-    def lay_anew(self) -> None:
-        """Sample each sheet once a cell, see :func:`~nlos_lit.functional.surfel_lattice.lay_anew`."""
-        origin = torch.tensor(self.lateral.origin, device=self.anchor.device)
-        self.place(*lay_anew(*self.placed(), self.albedo(), origin, self.cell))
-
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
         together = 0 if self.sheet is None else carry_along(self.sheet, self.raw_shift)
         depth = self.raw_depth + together
-        sideways = (self.raw_side[..., None] * self.axes).sum(1)
-        return self.anchor + (depth * (self.bin_length / 2))[:, None] * self.direction + sideways
+        return self.anchor + (depth * (self.bin_length / 2))[:, None] * self.direction
 
     def normal(self) -> Tensor:
         """``[M, 3]`` unit, towards the wall's side."""
@@ -223,8 +216,8 @@ class SurfelModel(nn.Module):
         centre, normal = self.placed()
         self.raw_normal.copy_(normal)
         self.anchor.copy_(centre)
-        for moved in (self.raw_depth, self.raw_shift, self.raw_side):
-            moved.zero_()
+        self.raw_depth.zero_()
+        self.raw_shift.zero_()
         self.sheet = None
 
     def trust(self) -> Tensor:
@@ -236,17 +229,20 @@ class SurfelModel(nn.Module):
         """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`."""
         return bending(*self.placed(), self.trust(), self.pairs)
 
-    def albedo_steps(self) -> Tensor:
-        """How much albedos of neighbours differ, see the function of the same name."""
-        return albedo_steps(self.albedo(), self.pairs)
+    def albedo_cost(self, evenness: float, bright: float, albedo: Tensor | None = None) -> Tensor:
+        """What albedos cost that differ between neighbours, or exceed the scene's own level.
 
-    def brightness(self) -> Tensor:
-        """How far albedos exceed the scene's own level, see the function of the same name."""
-        return brightness(self.albedo())
+        Args:
+            evenness: weight of :func:`~nlos_lit.functional.surfel_graph.albedo_steps` …
+            bright: … and of :func:`~nlos_lit.functional.surfel_graph.brightness`.
+            albedo: ``[M]`` instead of the surfels' own, whose level stays.
 
-    def sideways(self) -> Tensor:
-        """How far surfels lie from where the round began, ``½ Σ (cells/SIDE)²``."""
-        return 0.5 * (self.raw_side / SIDE).square().sum()
+        Returns:
+            A scalar, differentiable.
+        """
+        own = self.albedo()
+        level, albedo = level_of(own), own if albedo is None else albedo
+        return evenness * albedo_steps(albedo, self.pairs, level) + bright * brightness(albedo, level)
 
     @torch.no_grad()
     def update_visibility(self, spots: Tensor | None = None) -> None:
@@ -315,19 +311,21 @@ class SurfelModel(nn.Module):
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""
         return (length - self.t_start) / self.bin_length
 
-    def transients(self, paths: Paths, spots: Tensor, hooks: Hooks) -> Tensor:
+    def transients(self, paths: Paths, spots: Tensor, hooks: Hooks, albedo: Tensor | None = None) -> Tensor:
         """Stages 2 and 3: light on arrival, H_r.
 
         Args:
             paths: of the spots, for unit albedo.
             spots: ``[B]`` rows of the capture.
             hooks: effects that act on paths, times and transients.
+            albedo: ``[M]`` instead of the surfels' own.
 
         Returns:
             ``[B, T]`` from the capture's bin 0 to the gate's end.
         """
+        albedo = self.albedo() if albedo is None else albedo
         energy, length = (
-            hooks.path(paths.contribution * self.albedo()[:, None], paths, spots),
+            hooks.path(paths.contribution * albedo[:, None], paths, spots),
             hooks.time(paths.length, paths, spots),
         )
         transients = SplineSplat.apply(energy.flatten(1), self.arrival(length).flatten(1), self.n_bins)

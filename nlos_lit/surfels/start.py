@@ -19,7 +19,9 @@ from nlos_lit.surfels.growth import rank_one, score, start_response, volume_maxi
 from nlos_lit.surfels.model import Lateral, SurfelModel, points_along
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
-WIDEST = 4.0  # bins of path that a surfel's side spans at most; docs/surface.md says what wider ones cost
+BYTES_KEPT = 24  # of a path while albedos are solved for: six numbers
+WIDEST = 4.0  # bins of path that a surfel's side spans at most while sheets are found …
+FINER = 2.0  # … and while outlines are
 RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
 
 
@@ -99,15 +101,18 @@ def seed_surfels(
         laser_sensor=sensor,
     )
     model.set_passing(0.5)
-    parts = s.subdivide or math.ceil(float(model.cell.max()) / (WIDEST * capture.bin_length))
+    widest = float(model.cell.max()) / capture.bin_length  # bins
+    parts = s.subdivide or math.ceil(widest / WIDEST)
+    finer = 1 if s.subdivide else math.ceil(widest / parts / FINER)
     points = s.quadrature or points_along(float(model.cell.max()) / parts, capture.bin_length)
-    step_bytes = len(model) * (parts * points) ** 2 * min(s.batch, len(train)) * BYTES_PER_PATH
-    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots a step (surfels.batch)"
+    a_spot = len(model) * (parts * points) ** 2  # paths
+    step_bytes = a_spot * max(min(s.batch, len(train)) * BYTES_PER_PATH, len(tested) * BYTES_KEPT)
+    smaller = "take fewer surfels (surfels.max_seeds) or fewer spots (surfels.batch, surfels.test_spots)"
     check_machine(step_bytes + 8 * counts.numel(), "one step of the surface fit", smaller)
     fit = SurfelFit(
         model, capture, grid, counts, train, s, candidates.take(best), extension, generator, order
     )
     fit.match_energy()
     scan_shapes = scan_shapes and any(effect.shapes for effect in extension.effects)
-    fit.schedule(plan_from_seeds(s, parts, scan_shapes), s.more, lay=True)
+    fit.schedule(plan_from_seeds(s, parts, finer, scan_shapes), s.more)
     return fit

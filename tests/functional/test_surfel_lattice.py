@@ -1,20 +1,21 @@
-"""Sheets laid anew: hand-worked cases, and that a wavy sheet stays where it is."""
+"""Sheets that go on: hand-worked cases of where, and at what depth."""
 
 import math
 
 import pytest
 import torch
 
-from nlos_lit.functional.surfel_lattice import COVERED, LAYER, WIDE, lay_anew
+from nlos_lit.functional.surfel_lattice import LAYER, TAKEN, ring
 
 UP = torch.tensor([0.0, 0.0, -1.0])
 ORIGIN, CELL = torch.zeros(2), torch.tensor([0.1, 0.1])
 
 
-def laid(centre, normal=None, albedo=None):
+def around(centre, normal=None, albedo=None, source=None):
     normal = UP.expand(len(centre), 3) if normal is None else normal
     albedo = torch.ones(len(centre)) if albedo is None else albedo
-    return lay_anew(centre, normal, albedo, ORIGIN, CELL)
+    source = torch.ones(len(centre), dtype=torch.bool) if source is None else source
+    return ring(centre, normal, albedo, source, ORIGIN, CELL)
 
 
 def board(n=5, z=1.0):
@@ -22,59 +23,87 @@ def board(n=5, z=1.0):
     return torch.cat([torch.cartesian_prod(x, x), torch.full((n * n, 1), z)], 1)
 
 
-def test_a_board_with_a_surfel_a_cell_stays():
-    centre, normal, albedo = laid(board())
-    middle = (centre[:, :2].abs() < 0.15).all(1)
-    assert int(middle.sum()) == 9
-    wanted = board(3)[torch.argsort(board(3) @ torch.tensor([10.0, 1.0, 0.0]))]
-    found = centre[middle][torch.argsort(centre[middle] @ torch.tensor([10.0, 1.0, 0.0]))]
-    assert torch.allclose(found, wanted, atol=1e-4)
-    assert torch.allclose(normal, UP.expand(len(normal), 3))
-    assert torch.allclose(albedo[middle], torch.ones(9))
-    assert float(centre[:, :2].abs().max()) < 0.25  # nothing beyond its outline
+def cells(centre):
+    return {(round(x / 0.1), round(y / 0.1)) for x, y, _ in centre.tolist()}
 
 
-def test_a_leaning_sheet_is_sampled_on_its_own_plane_and_crowds_become_one():
-    places = board(7)[:, :2].repeat_interleave(4, 0)
-    places = places + 0.04 * (torch.rand(places.shape, generator=torch.Generator().manual_seed(1)) - 0.5)
-    centre = torch.cat([places, 1 + 0.5 * places[:, :1]], 1)
-    leaning = torch.nn.functional.normalize(torch.tensor([0.5, 0.0, -1.0]), dim=0).expand(len(centre), 3)
-    found, normal, albedo = laid(centre, leaning)
-    inside = (found[:, :2].abs() < 0.25).all(1)
-    assert int(inside.sum()) == 25
-    assert torch.allclose(found[:, 2], 1 + 0.5 * found[:, 0], atol=1e-5)
-    assert torch.allclose(normal, leaning[: len(normal)], atol=1e-6)
-    assert torch.allclose(albedo[inside], torch.ones(25))
+def test_a_board_goes_on_by_one_ring_in_its_own_plane():
+    centre, normal, albedo = around(board(3))
+    assert cells(centre) == {(i, j) for i in range(-2, 3) for j in range(-2, 3) if max(abs(i), abs(j)) == 2}
+    assert len(centre) == 16
+    assert torch.allclose(centre[:, 2], torch.ones(16))
+    assert torch.allclose(normal, UP.expand(16, 3))
+    assert torch.allclose(albedo, torch.ones(16))
+
+
+def test_a_leaning_sheet_goes_on_in_its_own_plane():
+    centre = board(3)
+    centre[:, 2] = 1 + 0.5 * centre[:, 0] - 0.2 * centre[:, 1]
+    leaning = torch.nn.functional.normalize(torch.tensor([0.5, -0.2, -1.0]), dim=0)
+    found, normal, _ = around(centre, leaning.expand(9, 3))
+    assert torch.allclose(found[:, 2], 1 + 0.5 * found[:, 0] - 0.2 * found[:, 1], atol=1e-6)
+    assert torch.allclose(normal, leaning.expand(16, 3), atol=1e-6)
+
+
+def bowl(centre):
+    """z = 1 + 2 x² + y², and its normals."""
+    x, y = centre[:, 0], centre[:, 1]
+    places = torch.stack([x, y, 1 + 2 * x**2 + y**2], 1)
+    return places, torch.nn.functional.normalize(torch.stack([4 * x, 2 * y, -torch.ones_like(x)], 1), dim=1)
+
+
+def test_a_hole_in_a_curved_sheet_is_filled_where_the_sheet_is():
+    places, normal = bowl(board(5))
+    inside = torch.arange(25) != 12
+    found, facing, _ = around(places[inside], normal[inside])
+    (middle,) = [k for k, (x, y, _) in enumerate(found.tolist()) if abs(x) < 0.01 and abs(y) < 0.01]
+    assert found[middle, 2] == pytest.approx(1.0, abs=1e-6)
+    assert torch.allclose(facing[middle], UP, atol=1e-6)
+
+
+def test_beyond_an_outline_a_curved_sheet_bends_away_by_less_than_from_a_plane():
+    places, normal = bowl(board(5))
+    found, _, _ = around(places, normal)
+    (right,) = [k for k, (x, y, _) in enumerate(found.tolist()) if abs(x - 0.3) < 0.01 and abs(y) < 0.01]
+    # Planes through the two columns next to it, and their weights with it.
+    near, far = math.exp(-1 / 2), math.exp(-2)
+    planes = (near * (1.08 + 0.1 * 0.8) + far * (1.02 + 0.2 * 0.4)) / (near + far)
+    assert 0 < 1.18 - found[right, 2] < 1.18 - planes
 
 
 @pytest.mark.parametrize(("apart", "sheets"), [(0.98 * LAYER, 1), (1.02 * LAYER, 2)])
-def test_layers_a_little_more_than_a_cell_apart_are_two_sheets(apart, sheets):
+def test_layers_a_little_more_than_a_cell_apart_go_on_by_themselves(apart, sheets):
     centre = torch.cat([board(3), board(3, 1.0 + apart * 0.1)])
-    found = laid(centre)[0]
-    assert int((found[:, :2].abs() < 0.05).all(1).sum()) == sheets
+    assert len(around(centre)[0]) == 16 * sheets
 
 
-@pytest.mark.parametrize(("share", "stays"), [(0.98, False), (1.02, True)])
-def test_a_cell_must_be_covered_in_part(share, stays):
-    # One surfel covers the cell by exp(-r²/2 WIDE²)/(2π WIDE²), r cells from its middle.
-    r = WIDE * math.sqrt(-2 * math.log(share * COVERED * 2 * math.pi * WIDE**2))
-    assert 0.25 < r < 0.5
-    found = laid(torch.tensor([[0.1 * r, 0.0, 1.0]]))[0]
-    assert len(found) == (1 if stays else 0)
+def test_a_sheet_goes_on_past_another_in_front():
+    front = torch.tensor([[0.1, 0.0, 0.5]])  # a cell of the back one's ring
+    found, _, _ = around(torch.cat([board(1), front]), source=torch.tensor([True, False]))
+    back = found[found[:, 2] > 0.9]
+    assert len(back) == 8
 
 
-def test_at_an_outline_a_surfel_lies_where_the_sheet_is():
-    found = laid(torch.tensor([[0.02, 0.0, 1.0]]))[0]
-    assert torch.allclose(found, torch.tensor([[0.02, 0.0, 1.0]]), atol=1e-6)
+@pytest.mark.parametrize(("off", "free"), [(0.98 * TAKEN, False), (1.02 * TAKEN, True)])
+def test_a_cell_is_free_where_no_surfel_of_the_sheet_lies_in_it(off, free):
+    centre = torch.tensor([[0.0, 0.0, 1.0], [0.1 + 0.1 * off, 0.0, 1.0]])
+    found, _, _ = around(centre, source=torch.tensor([True, False]))
+    assert ((1, 0) in cells(found)) == free
 
 
-def test_dark_surfels_have_little_say_in_where_a_sheet_lies_and_steep_ones_stay():
+def test_only_around_sources_and_with_the_brightness_of_what_lies_within():
+    albedo = torch.tensor([1.0, 0.01, 0.01])
+    row = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.2, 0.0, 1.0]])
+    found, _, light = around(row, albedo=albedo, source=albedo > 0.5)
+    assert max(i for i, _ in cells(found)) == 1
+    assert light.min() > 0.9
+
+
+def test_dark_surfels_have_little_say_in_where_a_sheet_lies_and_steep_ones_take_no_part():
     centre = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, 1.1]])
-    found = laid(centre, albedo=torch.tensor([1.0, 0.001]))[0]
-    assert found[0, 2] == pytest.approx(1.0, abs=1e-3)
+    found, _, _ = around(centre, albedo=torch.tensor([1.0, 1e-5]))
+    assert found[:, 2].max() < 1.001
     steep = torch.nn.functional.normalize(torch.tensor([[1.0, 0.0, -0.1]]), dim=1)
-    both = laid(centre, torch.cat([UP[None], steep]))
-    assert torch.equal(both[0][-1], centre[1])
-    assert torch.equal(both[1][-1], steep[0])
-    alone = laid(centre[1:], steep)
-    assert torch.equal(alone[0], centre[1:])
+    both = around(centre, torch.cat([UP[None], steep]))
+    assert torch.allclose(both[0][:, 2], torch.ones(8))
+    assert len(around(centre[1:], steep)[0]) == 0

@@ -14,11 +14,13 @@ from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
-from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, plan_from_seeds, rounds_of
+from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, plan_from_seeds
 from nlos_lit.surfels.growth import Seeds
 
 pytestmark = FORWARD_MODE
-SETTINGS = SurfelSettings(contest=3, rounds=2, steps=4, more=2, batch=24, test_spots=50, quadrature=1)
+SETTINGS = SurfelSettings(
+    contest=3, rounds=2, outlines=1, steps=3, more=2, batch=24, test_spots=50, quadrature=1
+)
 
 
 def begun() -> SurfelFit:
@@ -32,7 +34,7 @@ def begun() -> SurfelFit:
     fit.settings, fit.tested = SETTINGS, fit.order[:50]
     fit.grid = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
     fit.reserve = Seeds(torch.tensor([[0.0, 0.0, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
-    fit.schedule(plan_from_seeds(SETTINGS, 2, scan_shapes=True), SETTINGS.more)
+    fit.schedule(plan_from_seeds(SETTINGS, 2, 2, scan_shapes=True), SETTINGS.more)
     return fit
 
 
@@ -59,13 +61,13 @@ def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_pa
     straight, stopped, moments, tried = begun(), begun(), 0, []
     while not straight.finished:
         straight.begin_round()
-        tried += straight.state()["plan"]
+        tried.append(straight.state()["undo"])
         while not straight.round_done:
             straight.step()
         straight.end_round()
     assert straight.history[0]["surfels"] <= 12
-    assert len(straight.history) > 3  # rounds were added
-    assert any(Round(*each).trial for each in tried), "no surfels were divided on trial"
+    assert len(straight.history) > 4  # rounds were added
+    assert any(each is not None for each in tried), "no round could have been undone"
     while not stopped.finished:
         stopped = through_a_file(stopped, tmp_path / "state.pt")
         if not stopped.in_round:
@@ -114,7 +116,7 @@ def test_a_state_is_a_copy():
 
 def test_rates_fall_within_a_round_and_the_last_cools_down():
     fit = begun()
-    fit.schedule(rounds_of(4, 2, settle=True))
+    fit.schedule([Round(4, left=1, settling=True), Round(8)])
     rates = []
     while not fit.finished:
         if not fit.in_round:
@@ -131,22 +133,21 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
 
 
 def test_a_plan_is_the_rounds_in_order():
-    settings = dataclasses.replace(SETTINGS, rounds=3, steps=10, contest=7)
-    contest = Round(7, left=3, settling=True, contest=True)
-    assert plan_from_seeds(settings, 2, scan_shapes=False) == [
+    settings = dataclasses.replace(SETTINGS, rounds=2, outlines=2, steps=10, contest=7)
+    contest = Round(7, left=4, settling=True, contest=True)
+    assert plan_from_seeds(settings, 2, 3, scan_shapes=False) == [
         contest,
-        Round(10, left=2, settling=True, parts=2),
-        Round(10, left=1, grow=True),
-        Round(20, grow=True),
+        Round(10, left=3, settling=True, parts=2),
+        Round(10, left=2, grow=True),
+        Round(10, left=1, parts=3, outline=True),
+        Round(20, outline=True),
     ]
-    assert plan_from_seeds(settings, 1, scan_shapes=True) == [
-        contest,
-        Round(10, left=2, settling=True),
-        Round(10, left=1, grow=True, shapes=True),
-        Round(20, grow=True),
+    bare = dataclasses.replace(settings, outlines=0, contest=0)
+    assert plan_from_seeds(bare, 1, 2, scan_shapes=True) == [
+        Round(10, left=1, settling=True),
+        Round(20, grow=True, shapes=True),
     ]
-    without = dataclasses.replace(settings, contest=0)
-    assert plan_from_seeds(without, 2, scan_shapes=False)[0] == Round(10, left=2, settling=True, parts=2)
+    assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, 2, scan_shapes=True)) == 2
 
 
 def test_seeds_stand_still_while_they_contest_and_faint_ones_go():

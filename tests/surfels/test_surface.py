@@ -19,8 +19,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
-from nlos_lit.functional.surfel_graph import brightness
+from nlos_lit.functional.surfel_graph import brightness, level_of
 from nlos_lit.model.build import PipelineSettings, build_pipeline
+from nlos_lit.surfels import start
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.fit import WORTH, Round, SurfelFit, SurfelSettings
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels, score_spots
@@ -35,9 +36,9 @@ from nlos_lit.surfels.growth import (
     prune_and_grow,
     support,
 )
-from nlos_lit.surfels.model import OPAQUE, SIDE, SurfelModel
+from nlos_lit.surfels.model import OPAQUE, SurfelModel
 
-QUICK = SurfelSettings(contest=40, rounds=3, steps=100, more=0, test_spots=200, floor=0.15, per_cell=2)
+QUICK = SurfelSettings(contest=40, rounds=2, outlines=1, more=0, test_spots=200, floor=0.15, per_cell=2)
 BIN = 0.0096
 
 
@@ -116,7 +117,7 @@ def test_places_and_normals_lie_on_the_plates(fitted):
 
 def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
     capture, held, intensity, grid, _ = fitted
-    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=2, steps=8)
+    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, rounds=1, steps=8)
     counts = capture.counts.copy()
     counts[held] = 7 * counts[held][:, ::-1] + 1
     changed = dataclasses.replace(capture, counts=counts)
@@ -136,77 +137,44 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
 
 def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
     capture, held, intensity, grid, _ = fitted
-    train, short = np.flatnonzero(~held), dataclasses.replace(QUICK, contest=0, rounds=1, steps=20)
+    train = np.flatnonzero(~held)
+    short = dataclasses.replace(QUICK, contest=0, rounds=1, outlines=0, steps=20)
     seen, deviances, results = [], [], []
-    for more in (0, 1, 6):
+    for more in (0, 1, 3):
         settings = dataclasses.replace(short, more=more)
         progress = (lambda *count: seen.append(count)) if more == 1 else None
         result = fit_surfels(capture, intensity, grid, settings, train, progress=progress)
         deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
         results.append(result)
-    rounds = [len(result.history) for result in results]
-    assert rounds[:2] == [1, 3]  # the last is on sheets laid anew
-    assert 4 <= rounds[2] <= 8
+    assert [len(result.history) for result in results] == [1, 2, 4]
     assert deviances[0] > deviances[1] > deviances[2]
-    # Cells are coarse here: the first round more begins with surfels divided in four.
     of = dict(seen)
-    assert [k for k, _ in seen] == list(range(1, 101))
-    assert [of[k] for k in (40, 41, 60, 61)] == [40, 60, 60, 100]
-    cells = [float(result.model.cell[0]) for result in results]
-    assert cells[1] == pytest.approx(cells[0] / 2)
+    assert [k for k, _ in seen] == list(range(1, 81))
+    assert [of[k] for k in (40, 41, 80)] == [40, 80, 80]
     own = results[-1].fit.copy(Extension([]), 0)
     own.counts = own.model.expected(own.train)
     own.schedule([], 4)
     assert own.finished
 
 
-def test_surfels_are_not_divided_where_that_is_not_worth_it(fitted):
-    fit = fitted[-1].fit.copy(Extension([]), 0)
-    fit.counts = torch.poisson(fit.model.expected(fit.train), generator=torch.Generator().manual_seed(1))
-    fit.settings = dataclasses.replace(QUICK, steps=20, albedo_rate=0.0, depth_rate=0.0, response_rate=0.0)
-    every_other = torch.arange(len(fit.train)) % 2
-    fit.counts = fit.counts * (0.7 + 0.6 * every_other)[:, None]  # no surface does that
-    before = {name: value.clone() for name, value in fit.model.state_dict().items() if torch.is_tensor(value)}
-    fit.schedule([], 4)
-    assert fit.plan == [Round(20, grow=True, parts=2, trial=True)]
-    fit.finish()
-    assert [entry["surfels"] > 3 * len(fit.model) for entry in fit.history] == [True]
-    after = fit.model.state_dict()
-    assert all(torch.equal(after[name], value) for name, value in before.items())
-    for change in ({"subdivide": 1}, {"most": 4 * len(fit.model) - 1}):
-        other = fit.copy(Extension([]), 0)
-        other.settings = dataclasses.replace(fit.settings, **change)
-        other.schedule([], 1)
-        assert [each.parts for each in other.plan] == [1]
-
-
-@pytest.mark.parametrize(("excess", "parts"), [(0.9, 1), (1.1, 2)])
-def test_what_is_unexplained_must_be_worth_the_new_parameters_before_surfels_are_divided(
-    fitted, monkeypatch, excess, parts
-):
-    fit = fitted[-1].fit.copy(Extension([]), 0)
-    left = excess * WORTH * 8 * len(fit.model) * 2 / fit.counts.numel()
-    monkeypatch.setattr(fit, "_deviance", lambda: (0.7 + left, 0.7))
-    fit.schedule([], 1)
-    assert [each.parts for each in fit.plan] == [parts]
-
-
-@pytest.mark.parametrize(("gain", "stays"), [(0.9, False), (1.1, True)])
-def test_divided_surfels_stay_where_they_gain_what_parameters_must(fitted, monkeypatch, gain, stays):
+@pytest.mark.parametrize(("gain", "goes_on"), [(0.9, False), (1.1, True)])
+def test_a_round_more_must_gain_what_parameters_must(fitted, monkeypatch, gain, goes_on):
     fit = fitted[-1].fit.copy(Extension([]), 0)
     fit.settings = dataclasses.replace(QUICK, steps=1)
-    monkeypatch.setattr(fit, "_deviance", lambda: (1.0, 0.7))
-    fit.schedule([], 1)
-    few = len(fit.model)
+    before = 1.0
+    monkeypatch.setattr(fit, "_deviance", lambda: (before, 0.7))
+    fit.schedule([], 2)
+    assert len(fit.plan) == 1
 
     def after() -> tuple[float, float]:
         sensor = sum(p.numel() for p in fit.model.laser_sensor.parameters())
-        return 1 - gain * WORTH * (2 * len(fit.model) + sensor) * 2 / fit.counts.numel(), 0.7
+        return before - gain * WORTH * (2 * len(fit.model) + sensor) * 2 / fit.counts.numel(), 0.7
 
+    fit.begin_round()
+    fit.step(), fit.step()
     monkeypatch.setattr(fit, "_deviance", after)
-    fit.finish()
-    assert (len(fit.model) > 2 * few) == stays
-    assert stays or len(fit.model) == few
+    fit.end_round()
+    assert fit.finished != goes_on
 
 
 def test_only_the_given_spots_are_scored(fitted):
@@ -236,12 +204,11 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
     """The grid's middle, a period of 4 bins, is nowhere near the true one."""
     capture, held, intensity, grid, _ = fitted
     rough, train = rippled(capture, 11.3, 0.2), np.flatnonzero(~held)
-    settings = dataclasses.replace(QUICK, rounds=2)
     seen, scores = [], {}
     for scan_shapes in (False, True):
         extension = Extension(build_effects(["tcspc_nonlinearity"], Scan.of(rough)))
         result = fit_surfels(
-            rough, intensity, grid, settings, train, extension=extension, heldout_spots=np.flatnonzero(held),
+            rough, intensity, grid, QUICK, train, extension=extension, heldout_spots=np.flatnonzero(held),
             scan_shapes=scan_shapes, progress=lambda done, total: seen.append((done, total)),
         )  # fmt: skip
         scores[scan_shapes] = result.heldout.deviance_per_bin / result.heldout.deviance_noise
@@ -249,7 +216,7 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
         assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
     assert ripple["amplitude"] == pytest.approx(0.2, abs=0.03)
     assert scores[True] < scores[False] - 0.02
-    assert seen[340:] == [(k, 340) for k in range(1, 341)]
+    assert seen[440:] == [(k, 440) for k in range(1, 441)]
 
 
 def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
@@ -283,7 +250,7 @@ def test_progress_counts_every_step(fitted):
         np.flatnonzero(~held),
         progress=lambda done, total: seen.append((done, total)),
     )
-    assert seen == [(k, 12) for k in range(1, 13)]
+    assert seen == [(k, 15) for k in range(1, 16)]
 
 
 @pytest.mark.parametrize("ambient", [0.3, 40.0])
@@ -399,14 +366,16 @@ def test_neighbours_in_a_plane_share_their_worth(fitted):
 
 
 def test_what_outshines_the_scene_costs():
-    even = torch.full((8,), 0.3)
-    assert brightness(even) == 0
-    assert brightness(torch.cat([even, torch.full((4,), 0.01)])) == 0
-    outshone = torch.cat([even, torch.tensor([0.6])]).requires_grad_()
-    assert brightness(outshone).item() == pytest.approx(0.5 * (np.log(2) / 0.2) ** 2, rel=1e-5)
-    (slope,) = torch.autograd.grad(brightness(outshone), outshone)
+    even, level = torch.full((8,), 0.3), torch.tensor(0.3)
+    assert brightness(even, level) == 0
+    assert brightness(torch.cat([even, torch.zeros(4)]), level) == 0
+    outshone = torch.cat([even, torch.tensor([0.6, 0.0])]).requires_grad_()
+    assert level_of(outshone) == level
+    assert brightness(outshone, level).item() == pytest.approx(0.5 * (np.log(2) / 0.2) ** 2, rel=1e-5)
+    (slope,) = torch.autograd.grad(brightness(outshone, level), outshone)
     assert slope[8] > 0
     assert not slope[:8].any()
+    assert not slope[9:].any()
 
 
 def test_a_shift_takes_the_sheet_along(fitted):
@@ -427,23 +396,6 @@ def test_a_shift_takes_the_sheet_along(fitted):
     assert not model.raw_shift.any()
 
 
-def test_a_side_is_a_way_within_the_surfels_own_plane(fitted):
-    capture, result = fitted[0], fitted[-1]
-    model = flat_sheet(capture, result, tilt=0.5)
-    leaning, cell = model.normal()[4].detach(), model.cell[0].item()
-    before = model.centre().detach()
-    with torch.no_grad():
-        model.raw_side[4] = torch.tensor([SIDE, 0.0])
-    moved = (model.centre() - before)[4]
-    assert abs(torch.dot(moved, leaning).item()) < 1e-6
-    assert moved[:2].norm().item() == pytest.approx(SIDE * cell, rel=1e-4)  # it covers its cell from above
-    assert model.sideways().item() == pytest.approx(0.5)  # one deviation
-    kept = model.centre().detach()
-    model.lift()
-    assert torch.equal(model.centre(), kept)
-    assert model.sideways() == 0
-
-
 def outside(result: FittedSurfels) -> float:
     """How far the front plate's light lies outside its outline on average, m."""
     points = result.points()
@@ -453,13 +405,14 @@ def outside(result: FittedSurfels) -> float:
     return np.average(beyond[front], weights=points.albedo[front])
 
 
-def test_surfels_that_move_sideways_come_in_from_beyond_an_outline(fitted):
-    capture, held, intensity, grid, still = fitted
-    settings = dataclasses.replace(QUICK, side_rate=0.05)
-    train = np.flatnonzero(~held)
-    moved = fit_surfels(capture, intensity, grid, settings, train, seed=0, heldout_spots=np.flatnonzero(held))
-    assert outside(moved) < 0.6 * outside(still)
-    assert moved.heldout.deviance_per_bin < still.heldout.deviance_per_bin
+def test_outlines_are_where_the_plates_end(fitted):
+    capture, held, intensity, grid, result = fitted
+    settings, train = dataclasses.replace(QUICK, rounds=6, outlines=0), np.flatnonzero(~held)
+    one_by_one = fit_surfels(
+        capture, intensity, grid, settings, train, seed=0, heldout_spots=np.flatnonzero(held)
+    )
+    assert outside(result) < outside(one_by_one)
+    assert result.heldout.deviance_per_bin < one_by_one.heldout.deviance_per_bin
 
 
 def test_normals_follow_places_while_a_sheet_is_laid(fitted):
@@ -571,6 +524,19 @@ def test_impossible_input_is_refused(fitted):
         SurfelSettings(floor=1.5)
     with pytest.raises(UserError, match="evenness"):
         SurfelSettings(evenness=-1.0)
+
+
+@pytest.mark.parametrize(("batch", "kept"), [(1, 24 * 200), (200, 160 * 200)])
+def test_memory_is_that_of_a_step_or_of_the_paths_that_are_kept(fitted, monkeypatch, batch, kept):
+    capture, held, intensity, grid, _ = fitted
+    asked = []
+    monkeypatch.setattr(start, "check_machine", lambda size, *_: asked.append(size))
+    train, settings = (
+        np.flatnonzero(~held),
+        dataclasses.replace(QUICK, batch=batch, quadrature=1, subdivide=1),
+    )
+    fit = start.seed_surfels(capture, intensity, grid, settings, train)
+    assert asked == [len(fit.model) * kept + 8 * fit.counts.numel()]
 
 
 @pytest.mark.parametrize("dark", [True, False])

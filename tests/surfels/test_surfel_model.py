@@ -13,7 +13,9 @@ from data_modules.simulate.scenes import plate
 from nlos_lit.capture import Capture
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import (
+    ALIKE,
     BEND,
+    EDGE,
     STIFFNESS,
     albedo_steps,
     bending,
@@ -244,14 +246,14 @@ def test_bending_vanishes_on_a_sphere_and_punishes_turned_normals():
     assert bending(flat, facing, torch.ones(2), both).item() == pytest.approx(np.log(2), rel=1e-4)
 
 
-def test_uneven_albedos_cost_by_their_ratio():
-    both = torch.tensor([0, 1]), torch.tensor([1, 0])
-    even, double, more = (albedo_steps(torch.tensor([0.5, x]), both).item() for x in (0.5, 1.0, 2.0))
-    assert even == 0
-    assert double == pytest.approx(
-        np.sqrt((np.log(2) / 0.2) ** 2 + 1) - 1, rel=0.05
-    )  # FAINT moves it a little
-    assert more - double == pytest.approx(np.log(2) / 0.2, rel=0.1)  # nearly linear far out
+def test_an_edge_of_albedo_costs_little_more_the_higher_it_is():
+    both, level = (torch.tensor([0, 1]), torch.tensor([1, 0])), torch.tensor(2.0)
+    steps = [0.0, 0.02, 0.04, EDGE, 1.0]  # of the level
+    cost = [albedo_steps(torch.tensor([0.5, 0.5 + 2.0 * x]), both, level).item() for x in steps]
+    assert cost[0] == 0
+    assert 3 < cost[2] / cost[1] < 4.1  # a square below ALIKE …
+    size = np.sqrt(np.square(steps[3:]) + ALIKE**2) - ALIKE
+    assert cost[3:] == pytest.approx(EDGE * np.log1p(size / EDGE), rel=1e-4)  # … and a logarithm above EDGE
 
 
 @pytest.mark.parametrize("opaque", OPAQUE)

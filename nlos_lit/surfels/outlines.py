@@ -1,0 +1,123 @@
+"""How far sheets reach: extended beyond their outlines, and cut back to where the counts see light.
+
+Whether a place belongs to a sheet cannot be asked of each place by itself: its neighbours share the same
+light, and the answer for one depends on that for the others. So sheets are extended by rings all around, and
+the albedos of all surfels are solved for together. Expected counts are linear in them, and where nothing is,
+the likeliest albedo is zero.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.effects.hooks import NOTHING, Hooks
+from nlos_lit.functional.surfel_graph import level_of
+from nlos_lit.functional.surfel_lattice import ring
+from nlos_lit.surfels.growth import within_depths
+from nlos_lit.surfels.model import SurfelModel
+
+RINGS = 2  # cells by which sheets are extended at a time
+SOURCE = 0.1  # of the mean albedo: fainter surfels are not extended
+BEGIN = 0.5  # of the sheet's albedo, where the search for a new surfel's begins
+DIM = 0.1  # of the scene's level: fainter surfels are not there
+SEARCH, MEND = 30, 10  # iterations, among all candidates and when the others are gone
+CHUNK = 1 << 20  # paths at a time
+
+
+@torch.no_grad()
+def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
+    """Go on with all sheets by ``RINGS`` rings of cells, within the grid's depths.
+
+    They hide nothing, and are hidden by what is there.
+
+    Args:
+        model: whose surfels get more neighbours.
+        grid: of the volume.
+        spots: ``[B]`` rows of the capture for which it is found out who is hidden.
+    """
+    origin = torch.tensor(model.lateral.origin, device=model.anchor.device)
+    own, present = model.albedo(), len(model)
+    (centre, normal), albedo = model.placed(), own
+    for _ in range(RINGS):
+        more = ring(centre, normal, albedo, albedo > SOURCE * own.mean(), origin, model.cell)
+        inside = within_depths(more[0], grid)
+        centre, normal, albedo = (
+            torch.cat([old, new[inside]]) for old, new in zip((centre, normal, albedo), more, strict=True)
+        )
+    visible = model.visible
+    if len(visible):
+        seen = torch.ones(len(visible), len(centre) - present, dtype=torch.bool, device=visible.device)
+        seen[spots] = model.sees(spots, centre[present:])
+        visible = torch.cat([visible, seen], 1)
+    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]))
+    if len(visible):
+        model.visible = visible
+
+
+def solve_albedos(
+    model: SurfelModel,
+    spots: Tensor,
+    counts: Tensor,
+    evenness: float,
+    brightness: float,
+    iterations: int,
+    hooks: Hooks = NOTHING,
+) -> None:
+    """The likeliest albedos of all surfels together, all else as it is; a limited-memory quasi-Newton method.
+
+    It minimises ``Σ (μ - H ln μ)`` and the albedos' own cost (:meth:`SurfelModel.albedo_cost`) over albedos ≥
+    0. Each spot counts once, however few of all they are: what they leave open their noise must not say.
+    Paths are traced once.
+
+    Args:
+        model: whose albedos are set, linked.
+        spots: ``[B]`` rows of the capture.
+        counts: ``[B, T_gate]`` of them.
+        evenness: weight of steps between neighbours …
+        brightness: … and of albedos above the scene's level.
+        iterations: at most.
+        hooks: effects, which stand still.
+    """
+    device, level = counts.device, float(level_of(model.albedo()))
+    size = max(1, CHUNK // max(1, len(model) * model.quadrature**2))
+    with torch.no_grad():
+        parts = [(part, model.paths(part)) for part in spots.split(size)]
+    first = model.gate[0]
+
+    def cost(levels: np.ndarray) -> tuple[float, np.ndarray]:
+        x = torch.tensor(levels, dtype=torch.float32, device=device, requires_grad=True)
+        prior = model.albedo_cost(evenness, brightness, level * x)
+        total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0]
+        for (part, paths), seen in zip(parts, counts.split(size), strict=True):
+            arriving = model.transients(paths, part, hooks, level * x)
+            expected = model.record(arriving, part, hooks)[:, first:].clamp_min(1e-9).double()
+            nats = (expected - seen - torch.xlogy(seen.double(), expected / seen.clamp_min(1))).sum()
+            slope = slope + torch.autograd.grad(nats, x)[0]
+            total += float(nats.detach())
+        return total, slope.double().cpu().numpy()
+
+    begin = (model.albedo().detach() / level).double().cpu().numpy()
+    found = minimize(
+        cost,
+        begin,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0.0, None)] * len(begin),
+        options={"maxiter": iterations, "ftol": 1e-13, "gtol": 1e-3},
+    )
+    model.set_albedo(torch.tensor(level * found.x, dtype=torch.float32, device=device))
+
+
+@torch.no_grad()
+def cut_back(model: SurfelModel) -> None:
+    """Leave out surfels fainter than ``DIM`` of the scene's level.
+
+    Args:
+        model: of the surfels.
+    """
+    albedo = model.albedo()
+    model.keep(albedo > DIM * level_of(albedo))

@@ -1,0 +1,245 @@
+"""How far sheets reach: the albedos of all surfels solved for together, sheets extended and cut back."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, surfels
+from torch import Tensor
+
+from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.surfel_graph import level_of
+from nlos_lit.surfels.fit import FINEST, WORTH, Round, SurfelFit, SurfelSettings
+from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.outlines import DIM, RINGS, SEARCH, cut_back, extend, solve_albedos
+
+pytestmark = FORWARD_MODE
+CELL = 0.08
+DEEP = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
+WALL = capture_of(raster(10))
+SPOTS = torch.arange(100)
+
+
+def board(albedo: Tensor, z: float = 0.7, scene=WALL) -> SurfelModel:
+    """Surfels ``albedo`` ``[n, n]`` on a lattice, facing the wall; some hundred counts a spot."""
+    model, n = surfels(scene), len(albedo)
+    x = CELL * (torch.arange(n) - n // 2)
+    centre = torch.cat([torch.cartesian_prod(x, x), torch.full((n * n, 1), z)], 1)
+    model.lateral = model.lateral._replace(origin=(0.0, 0.0), pitch=(CELL, CELL))
+    model.cell = torch.tensor([CELL, CELL])
+    model.place(centre, torch.tensor([0.0, 0.0, -1.0]).expand(n * n, 3), albedo.flatten())
+    return model
+
+
+def test_albedos_are_found_together_and_there_are_none_where_nothing_is():
+    true = torch.ones(5, 5)
+    true[:, :2], true[0, 4] = 0.0, 0.0
+    counts = board(true).expected(SPOTS)
+    model = board(torch.full((5, 5), 0.5))
+    solve_albedos(model, SPOTS, counts, 0.0, 0.0, SEARCH)
+    found = model.albedo().detach().view(5, 5)
+    assert (found - true)[true == 1].abs().max() < 0.1
+    assert found[true == 0].max() < 0.1
+    noisy, errors = torch.poisson(counts, generator=torch.Generator().manual_seed(2)), []
+    for evenness in (0.0, 0.7):
+        solve_albedos(model, SPOTS, noisy, evenness, 0.0, SEARCH)
+        errors.append((model.albedo().view(5, 5) - true).abs().mean().item())
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_the_solution_is_that_of_the_cost_it_names():
+    """No change of one albedo lowers the likelihood with its prior."""
+    true = 0.3 + 0.7 * torch.rand(5, 5, generator=torch.Generator().manual_seed(1))
+    counts = torch.poisson(board(true).expected(SPOTS), generator=torch.Generator().manual_seed(2))
+    model = board(torch.full((5, 5), 0.6))
+    for _ in range(4):  # as often as it stops, since the level may change
+        solve_albedos(model, SPOTS, counts, 0.7, 0.0, SEARCH)
+    level = model.albedo().detach()
+
+    def cost(albedo: Tensor) -> float:
+        paths = model.paths(SPOTS)
+        expected = model.record(model.transients(paths, SPOTS, Extension([]), albedo), SPOTS, Extension([]))
+        expected = expected[:, model.gate[0] :].double()
+        nats = (expected - torch.xlogy(counts.double(), expected)).sum()
+        return float(nats + model.albedo_cost(0.7, 0.0, albedo))
+
+    with torch.no_grad():
+        least = cost(level)
+        for k in range(25):
+            for change in (0.95, 1.05):
+                moved = level.clone()
+                moved[k] *= change
+                assert cost(moved) > least
+
+
+def test_a_spot_counts_once():
+    """Of few spots the prior says more: their noise must not say what they leave open."""
+    counts = torch.poisson(
+        board(torch.ones(5, 5)).expected(SPOTS), generator=torch.Generator().manual_seed(2)
+    )
+    rough = {}
+    for few in (10, 100):
+        model = board(torch.ones(5, 5))
+        solve_albedos(model, SPOTS[:few], counts[:few], 30.0, 0.0, SEARCH)
+        rough[few] = model.albedo().std().item()
+    assert rough[10] < rough[100]
+
+
+def test_effects_stand_still_and_are_seen_through():
+    scan = Scan.of(WALL)
+    extension = Extension([effect_of("irf_tail", scan, fraction=0.3, decay=0.1)])
+    counts = board(torch.ones(5, 5)).expected(SPOTS, extension)
+    seen, blind = board(torch.full((5, 5), 0.5)), board(torch.full((5, 5), 0.5))
+    before = {name: value.clone() for name, value in extension.state_dict().items()}
+    solve_albedos(seen, SPOTS, counts, 0.7, 1.0, SEARCH, extension)
+    solve_albedos(blind, SPOTS, counts, 0.7, 1.0, SEARCH)
+    assert all(torch.equal(value, before[name]) for name, value in extension.state_dict().items())
+    assert all(p.grad is None for p in [*extension.parameters(), *seen.parameters()])
+    errors = [(m.albedo() - 1).abs().mean().item() for m in (seen, blind)]
+    assert errors[0] < 0.5 * errors[1]
+
+
+def test_rings_lie_within_the_grid_hide_nothing_and_are_hidden():
+    model = board(torch.ones(3, 3))
+    front = torch.tensor([[0.0, 0.0, 0.4]])
+    both = torch.cat([model.centre(), front]), torch.tensor([0.0, 0.0, -1.0]).expand(10, 3)
+    model.place(*both, torch.cat([torch.ones(9), torch.tensor([0.9])]))
+    model.opaque = 0.6
+    model.update_visibility()
+    before = model.visible.clone()
+    extend(model, DEEP, SPOTS)
+    assert torch.equal(model.visible[:, :10], before)
+    back = model.centre()[:, 2] > 0.6
+    assert int(back.sum()) == (3 + 2 * RINGS) ** 2
+    assert not model.visible[:, 10:][:, back[10:]].all()  # the one in front hides some
+    assert model.visible[:, ~back].all()  # and nothing hides what lies beside it
+    shallow = VolumeGrid((-1.0, -1.0, 0.55), (0.1, 0.1, 0.02), (20, 20, 20))
+    model = board(torch.ones(3, 3), z=0.45)
+    extend(model, shallow, SPOTS)
+    assert len(model) == 9
+
+
+def test_faint_surfels_are_not_extended():
+    albedo = torch.ones(3, 3)
+    albedo[0] = 0.01
+    model = board(albedo)
+    extend(model, DEEP, SPOTS)
+    assert model.centre()[:, 0].min() > -0.1 - RINGS * CELL
+    assert model.centre()[:, 0].max() > 0.05 + RINGS * CELL
+
+
+@pytest.mark.parametrize(("share", "stays"), [(0.95, False), (1.05, True)])
+def test_surfels_below_a_share_of_the_level_go(share, stays):
+    albedo = torch.ones(3, 3)
+    albedo[1, 1] = share * DIM
+    model = board(albedo)
+    assert level_of(model.albedo()).item() == pytest.approx(1.0, rel=1e-5)
+    cut_back(model)
+    assert len(model) == (9 if stays else 8)
+
+
+def outlined(number: int) -> SurfelFit:
+    """A board of 5 × 5 cells of which only some rows in the middle are known, one round of outlines on."""
+    true = board(torch.ones(5, 5))
+    scene = drawn(true, Extension([]), WALL, seed=3)
+    known = torch.zeros(5, 5)
+    known[1:-1, 2] = 1.0
+    start = board(known.clamp_min(1e-6))
+    keep = known.flatten() > 0
+    start.place(start.centre()[keep], start.normal()[keep], torch.full((int(keep.sum()),), 3.0))
+    fit = fit_of(start, scene)
+    fit.settings = SurfelSettings(steps=20, quadrature=2, subdivide=1)
+    fit.grid = DEEP
+    fit.schedule([Round(20, left=1, outline=True) for _ in range(number)])
+    fit.finish()
+    return fit
+
+
+def test_a_sheet_that_is_known_in_part_comes_out_whole_and_no_larger():
+    model = outlined(1).model
+    x, y, _ = (model.centre().detach() / CELL).round().T
+    inside = (x.abs() <= 2) & (y.abs() <= 2)
+    assert int(inside.sum()) == 25
+    albedo = model.albedo().detach()
+    assert float(albedo[~inside].sum() / albedo.sum()) < 0.1
+    assert float(albedo[inside].std() / albedo[inside].mean()) < 0.25
+
+
+def test_outlines_reach_the_noise_from_a_part_and_go_on_to_the_digit():
+    fit, again = outlined(2), outlined(2)
+    deviance, noise = fit._deviance()
+    assert deviance < 1.03 * noise
+    assert all(
+        torch.equal(v, w) for v, w in zip(fit.model.parameters(), again.model.parameters(), strict=True)
+    )
+
+
+def waiting(change: dict | None = None) -> SurfelFit:
+    """A board of 25 surfels, about to be asked whether more rounds follow."""
+    fit = fit_of(board(torch.ones(5, 5)), WALL)
+    fit.settings = dataclasses.replace(
+        SurfelSettings(steps=1, quadrature=1, visibility=False), **(change or {})
+    )
+    fit.grid = DEEP
+    return fit
+
+
+@pytest.mark.parametrize(
+    ("excess", "change", "parts"),
+    [
+        (0.9, {}, 1),
+        (1.1, {}, 2),
+        (1.1, {"subdivide": 1}, 1),
+        (1.1, {"most": 4 * 25 - 1}, 1),
+    ],
+)
+def test_surfels_are_divided_where_what_is_unexplained_could_be_worth_it(monkeypatch, excess, change, parts):
+    fit = waiting(change)
+    left = excess * WORTH * 8 * 25 * 2 / fit.counts.numel()
+    monkeypatch.setattr(fit, "_deviance", lambda: (0.7 + left, 0.7))
+    fit.schedule([], 1)
+    assert [each.parts for each in fit.plan] == [parts]
+
+
+@pytest.mark.parametrize(("wide", "parts"), [(0.98, 1), (1.02, 2)])
+def test_surfels_that_are_narrow_enough_are_not_divided(monkeypatch, wide, parts):
+    fit = waiting()
+    fit.model.cell = torch.full((2,), wide * FINEST * WALL.bin_length)
+    monkeypatch.setattr(fit, "_deviance", lambda: (9.0, 0.7))
+    fit.schedule([], 1)
+    assert [each.parts for each in fit.plan] == [parts]
+
+
+@pytest.mark.parametrize("divided", [True, False])
+@pytest.mark.parametrize(("gain", "stays"), [(0.9, False), (1.1, True)])
+def test_a_round_that_gains_too_little_is_undone(monkeypatch, divided, gain, stays):
+    fit = waiting({} if divided else {"subdivide": 1})
+    monkeypatch.setattr(fit, "_deviance", lambda: (9.0, 0.7))
+    fit.schedule([], 3)
+    before = {name: v.clone() for name, v in fit.model.state_dict().items() if torch.is_tensor(v)}
+
+    def after() -> tuple[float, float]:
+        return 9.0 - gain * WORTH * fit._n_parameters() * 2 / fit.counts.numel(), 0.7
+
+    fit.begin_round()
+    assert float(fit.model.cell.max()) == pytest.approx(CELL / 2 if divided else CELL)
+    fit.step(), fit.step()
+    monkeypatch.setattr(fit, "_deviance", after)
+    fit.end_round()
+    now = fit.model.state_dict()
+    kept = all(now[n].shape == v.shape and torch.equal(now[n], v) for n, v in before.items())
+    assert kept != stays
+    # Where finer surfels did not pay those that were go on; where these did not, nothing does.
+    assert [each.parts for each in fit.plan] == ([2 if divided else 1] if stays else [1] if divided else [])
+
+
+def test_the_level_does_not_ask_how_many_dark_surfels_lie_around():
+    bright = torch.cat([torch.full((30,), 0.8), torch.full((10,), 1.6)])
+    with_dark = torch.cat([bright, torch.zeros(400)])
+    assert level_of(with_dark) == level_of(bright)
+    assert level_of(bright).item() in np.float32([0.8, 1.6])
