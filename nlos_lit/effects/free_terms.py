@@ -17,6 +17,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.scan_pieces import bands, stretches
 from nlos_lit.effects.smooth import length, over_wall
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
@@ -342,39 +343,6 @@ class FreeSpotGain(Free):
     def quantities(self) -> dict[str, Quantity]:
         p = self.declared["field"]
         return {"rms": Quantity(self.value("field").new_tensor(self.width * p.scale), p.unit, kind=p.kind)}
-
-
-def bands(place: Tensor, number: int) -> Tensor:
-    """Indicators of equal bands.
-
-    Args:
-        place: ``[n]`` from 0 to 1.
-        number: of bands.
-
-    Returns:
-        ``[n, number]`` one where a place lies in the band, else zero.
-
-    Examples:
-        >>> bands(torch.tensor([0.0, 0.6, 1.0]), 2)
-        tensor([[1., 0.],
-                [0., 1.],
-                [0., 1.]])
-    """
-    index = (place * number).long().clamp(0, number - 1)
-    return torch.nn.functional.one_hot(index, number).float()
-
-
-def stretches(scan: Scan, number: int) -> Tensor:
-    """``[S, number]`` indicators of equal bands of the order of acquisition.
-
-    Args:
-        scan: of the capture.
-        number: of bands.
-
-    Returns:
-        one in the band of each spot, else zero.
-    """
-    return bands((scan.rank + 1) / 2, number)
 
 
 def response_changes(n_bins: int) -> Tensor:

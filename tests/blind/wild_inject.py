@@ -391,8 +391,8 @@ EFFECTS: dict[str, Hidden] = {
         baseline_skewed, (0.02, 0.06, 0.15), ("laser_sensor_baseline",), own=True, scan="confocal"
     ),
     "time_offset": Hidden(time_offset, (0.5, 1.5, 5.0), ("time_offset",)),
-    "time_warm_up": Hidden(time_warm_up, (0.5, 1.2, 3.0), ("time_drift",)),
-    "time_walk": Hidden(time_walk, (0.5, 1.2, 3.0), ("time_drift",)),
+    "time_warm_up": Hidden(time_warm_up, (0.5, 1.2, 3.0), ("time_drift",), ("line_delay",)),
+    "time_walk": Hidden(time_walk, (0.5, 1.2, 3.0), ("time_drift",), ("line_delay",)),
     "jitter_heavy": Hidden(jitter_heavy, (0.2, 0.5, 1.3), ("timing_jitter",)),
     "clock_scale": Hidden(clock_scale, (0.006, 0.02, 0.06), ("clock_scale",)),
     "tail_two_exponentials": Hidden(
@@ -406,7 +406,7 @@ EFFECTS: dict[str, Hidden] = {
     "wall_scratches": Hidden(wall_scratches, (0.06, 0.15, 0.4), ("wall_reflectance",), WALL[1:]),
     "vignetting_cos4": Hidden(vignetting_cos4, (0.05, 0.12, 0.35), ("vignetting",), ("wall_reflectance",)),
     "ambient_window": Hidden(ambient_window, (0.15, 0.4, 0.9), ("ambient_map",)),
-    "hum_harmonics": Hidden(hum_harmonics, (0.15, 0.4, 0.95), ("hum",)),
+    "hum_harmonics": Hidden(hum_harmonics, (0.15, 0.4, 0.95), ("hum",), ("ambient_drift",)),
     "hot_spots_log_normal": Hidden(hot_spots_log_normal, (0.7, 3.0, 12.0), ("hot_spots",)),
     "background_curve": Hidden(background_curve, (0.25, 0.5, 0.95), ("background_slope",), ("direct_leak",)),
     "leak_power_law": Hidden(leak_power_law, (1.5, 5.0, 15.0), ("direct_leak",), ("background_slope",)),

@@ -15,6 +15,7 @@ from effect_hand import SPOT, effect, hand_scan
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.scan_pieces import lines
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
 
 FIRST, LAST = GATE
@@ -81,6 +82,58 @@ def test_maps_hold_every_smooth_function_of_the_wall_but_the_constant(name, piec
     built.set(built.coefficients, 0.1)
     # Orthonormal: rms 0.1 · √(number of functions).
     assert built.quantities()["rms"].value.item() == pytest.approx(0.1 * math.sqrt(pieces**2 - 1), rel=1e-3)
+
+
+def test_ambient_drift_is_a_step_of_the_background_along_the_scan():
+    """A lamp that is on for the second half of the scan: e^{±0.2} of the mean level, whatever the wall."""
+    scan = grid_scan(16)  # 256 spots in 21 stretches
+    drift = effect("ambient_drift", scan=scan)
+    stretch = torch.arange(256) * 21 // 256
+    drift.set("level", torch.where(torch.arange(21) < 10, -0.2, 0.2))
+    background = drift.background(torch.full((5,), 3.0), torch.arange(256)).detach()
+    level = torch.where(stretch < 10, -0.2, 0.2)
+    assert background == pytest.approx(3 * torch.exp(level - level.mean())[:, None].expand(-1, 5), rel=1e-5)
+    assert drift.quantities()["peak_to_peak"].value.item() == pytest.approx(0.4, abs=1e-5)
+    assert effect("ambient_drift", scan=grid_scan(48)).functions.shape == (2304, 128)
+
+
+def test_lines_of_a_scan_end_at_flybacks_and_turns():
+    forth = torch.arange(16).reshape(4, 4)
+    back = forth.clone()
+    back[1::2] = back[1::2].flip(1)
+    for order, number, place in [
+        (forth, forth // 4, (forth % 4) / 1.5 - 1),
+        (forth.T, forth.T // 4, (forth.T % 4) / 1.5 - 1),
+        (back, forth // 4, (back % 4) / 1.5 - 1),
+    ]:
+        scan = dataclasses.replace(grid_scan(4), rank=order.flatten() / 7.5 - 1)
+        found, within = lines(scan)
+        assert found.tolist() == number.flatten().tolist()
+        assert within == pytest.approx(place.flatten(), abs=1e-6)
+
+
+def test_a_scan_without_lines_is_cut_into_stretches():
+    scattered = torch.rand(100, 2, generator=torch.Generator().manual_seed(3))
+    number, place = lines(
+        dataclasses.replace(grid_scan(10), places=(scattered,), rank=torch.linspace(-1, 1, 100))
+    )
+    assert number.tolist() == [k // 10 for k in range(100)]
+    assert place[:10] == pytest.approx(torch.linspace(-1, 1, 10))
+
+
+def test_line_delay_shifts_whole_lines_and_drifts_within_them():
+    delay = effect("line_delay", scan=grid_scan(4))
+    values = torch.zeros(8)
+    values[1], values[4 + 2] = 0.03, 0.015  # line 1 late, line 2 early at first and late at last
+    delay.set("delay", values)
+    shift = torch.zeros(4, 4)
+    shift[1] = 0.03
+    shift[2] = 0.015 * torch.linspace(-1, 1, 4)
+    shift = (shift - shift.mean()).flatten()
+    length = torch.full((16, 2, 1), 1.5)
+    late = delay.time(length, None, torch.arange(16)).detach()
+    assert late[:, 0, 0] - 1.5 == pytest.approx(shift, abs=1e-6)
+    assert delay.quantities()["peak_to_peak"].value.item() == pytest.approx(0.045, abs=1e-6)
 
 
 def test_reflectance_is_one_map_of_both_wall_points():

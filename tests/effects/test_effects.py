@@ -28,6 +28,7 @@ KNOWN = {
     "wall_scale": TIME,
     "laser_sensor_baseline": TIME,
     "time_drift": TIME,
+    "line_delay": TIME,
     "timing_jitter": TIME,
     "time_offset": TIME,
     "clock_scale": TIME,
@@ -37,6 +38,7 @@ KNOWN = {
     "wall_reflectance": SPOT,
     "vignetting": SPOT,
     "ambient_map": SPOT,
+    "ambient_drift": SPOT,
     "hum": SPOT,
     "background_slope": SPOT,
     "hot_spots": SPOT,
@@ -75,7 +77,7 @@ def test_stage_and_need_of_paths_follow_from_the_hooks():
     assert moving == {
         *("retroreflection", "specular_lobe", "occlusion", "wall_tilt", "wall_scale"),
         *("laser_sensor_baseline", "time_drift", "timing_jitter", "time_offset", "clock_scale"),
-        *("power_drift", "wall_reflectance", "vignetting"),
+        *("line_delay", "power_drift", "wall_reflectance", "vignetting"),
     }
 
 

@@ -37,7 +37,7 @@ from nlos_lit.surfels.model import SurfelModel, inverse_softplus
 
 pytestmark = FORWARD_MODE
 FINE, ROUGH = 1e-4, 2e-2  # steps; the response's kernel is rounded to single precision
-DELAYS = ("free_scan_delay", "free_wall_delay", "time_drift")
+DELAYS = ("free_scan_delay", "free_wall_delay", "time_drift", "line_delay")
 ACCEPTED = {
     "none": {},
     "gain and pile-up": {"vignetting": {"strength": 0.3}, "pile_up": {"detections": 0.5}},
@@ -185,7 +185,7 @@ def test_effect_columns_are_the_slope_of_the_render(name):
         rounded = effect.stage == "response"
         numeric = slope(model, whole, spots, change, ROUGH if rounded else FINE)
         largest = float(numeric.abs().max())
-        assert largest > 0 or name in FREE_NAMES, "only bands may hold none of these spots"
+        assert largest > 0 or name in {*FREE_NAMES, "line_delay"}, "only bands may hold none of these spots"
         tolerance = (1e-3 if rounded else 5e-5) * largest
         assert float((ours[:, column] - numeric).abs().max()) <= tolerance, parameter
     assert bool((ours != 0).any())
@@ -216,7 +216,7 @@ def test_columns_of_what_acts_alike_at_all_spots_are_worked_out_once(name, kind,
 def test_only_delays_have_factors(effect):
     """Of the registry: what turns the wall delays no spot as a whole."""
     _, _, scan, spots = setting("single")
-    assert (effect(scan).factors(spots) is not None) is (effect.name == "time_drift")
+    assert (effect(scan).factors(spots) is not None) is (effect.name in ("time_drift", "line_delay"))
 
 
 @pytest.mark.parametrize(("most", "groups"), [(1, 1), (2, 2), (5, 4), (16, 16), (55, 32), (56, 56), (99, 56)])

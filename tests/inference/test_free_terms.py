@@ -13,7 +13,8 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, bands, response_changes, time_bands
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, response_changes, time_bands
+from nlos_lit.effects.scan_pieces import bands
 from nlos_lit.inference import pool
 from nlos_lit.inference.pool import Candidate, screen
 from nlos_lit.inference.problem import build_problem
