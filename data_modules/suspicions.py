@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from data_modules.plan import light_of
 from data_modules.readers.assemble import counted, direct_pulse, smooth
+from data_modules.scan_direction import scan_direction
 from nlos_lit.capture import Capture
 from nlos_lit.capture.aperture import find_lattice, scan_geometry
 from nlos_lit.capture.errors import CaptureError
@@ -492,6 +493,19 @@ def time_order(capture: Capture) -> list[str]:
     return []
 
 
+def scan_lines(capture: Capture) -> list[str]:
+    """Light of the quiet bins that changes along the lines of the scan, and hardly from one to the next."""
+    found = scan_direction(capture) if capture.is_counts else None
+    if found is None or not found.turned or found.chance > CHANCE:
+        return []
+    times = found.along / max(found.across, 0.01)
+    return [
+        f"the light of bins without scene changes {times:.2g} times more along the lines of the scan than "
+        "across them: it seems to have been taken along the other axis; say so (scan_order=columns, or raster "
+        "where it is said to be columns), or effects that follow the scan are sought in the wrong order"
+    ]
+
+
 CHECKS: tuple[Callable[[Capture], list[str]], ...] = (
     gate_and_pulse,
     distances,
@@ -506,4 +520,5 @@ CHECKS: tuple[Callable[[Capture], list[str]], ...] = (
     wall,
     spacing,
     time_order,
+    scan_lines,
 )

@@ -11,6 +11,7 @@ from conftest import real_file
 
 from data_modules import suspicions
 from data_modules.readers import ReaderOptions, read_capture
+from data_modules.scan_direction import _changes, scan_direction
 from nlos_lit.capture import Capture
 
 SIDE, BINS, FIRST, PULSE = 24, 400, 60, 200
@@ -170,8 +171,10 @@ def test_numbers_of_few_digits_are_no_counts():
     assert suspicions.common_unit(np.unique(values.astype("f4")).astype(float)) is None
 
 
+CHARTS = ("data_dot_chart_65cm.mat", "data_resolution_chart_40cm.mat")
 MEASURED = [
-    *((f"data_{n}.mat", {}) for n in ("s_u", "diffuse_s", "dot_chart_65cm", "resolution_chart_40cm")),
+    *((f"data_{n}.mat", {}) for n in ("s_u", "diffuse_s")),
+    *((name, {"scan_order": "columns"}) for name in CHARTS),
     *((f"slab/letter_{n}.mat", {"bin_width_ps": 16.0, "wall_size": 0.7}) for n in ("s", "u_50", "u_70")),
 ]
 
@@ -181,6 +184,59 @@ def test_nothing_is_told_of_good_real_captures(name, given):
     capture = read_capture(real_file(f"measured/{name}"), options=ReaderOptions(**given))
     assert suspicions.suspicions(capture) == ()
     assert suspicions.dispersion(capture, 0.25)[0] == pytest.approx(1, abs=0.03)
+
+
+@pytest.mark.parametrize("name", CHARTS)
+def test_charts_were_scanned_along_the_other_axis(name):
+    told = suspicions.suspicions(read_capture(real_file(f"measured/{name}")))
+    assert [bool(re.search("along the other axis; say so .scan_order=columns", line)) for line in told] == [
+        True
+    ]
+
+
+def switched(order: np.ndarray, times: float = 3.0) -> Capture:
+    """A lamp that is on for stretches of the scan, taken in another order than the capture says."""
+    on = np.searchsorted([100, 130, 300, 410], order) % 2 == 1
+    lamp = np.random.default_rng(2).poisson(0.4 * (times - 1) * on[:, None], CLEAN.counts.shape)
+    return counts(CLEAN.counts + lamp.astype(np.uint32))
+
+
+def test_light_that_comes_and_goes_says_along_which_axis_was_scanned():
+    grid = np.arange(SIDE**2).reshape(SIDE, SIDE)
+    across, along = switched(grid.T.ravel()), switched(grid.ravel())
+    assert any("along the other axis" in line for line in suspicions.suspicions(across))
+    assert suspicions.suspicions(along) == ()
+    said = dataclasses.replace(across, scan_order=grid.T.ravel())
+    assert suspicions.suspicions(said) == ()
+    back = grid.copy()
+    back[1::2] = back[1::2, ::-1]
+    assert suspicions.suspicions(dataclasses.replace(switched(back.ravel()), scan_order=back.ravel())) == ()
+    assert any(
+        "along the other axis" in line
+        for line in suspicions.suspicions(dataclasses.replace(along, scan_order=grid.T.ravel()))
+    )
+
+
+def test_changes_of_white_noise_are_none_and_steps_are_worked_out_by_hand():
+    """A step of 6 standard deviations in the middle of every line of 24, looked at along and across it.
+
+    Windows of four on either side of a spot see it from nine spots: they hold 1 … 4 … 1 spots of the other
+    level, and 8 changes of 6 · (1, 2, 3, 4, 4, 3, 2, 1)/4 are among 16 a line; of their squares' mean half
+    the window is taken.
+    """
+    step = np.zeros((24, 24))
+    step[:, 12:] = 6
+    squares = [36 * (k / 4) ** 2 for k in (1, 2, 3, 4, 4, 3, 2, 1)]
+    assert _changes(step) == pytest.approx(sum(squares) / 16 * 4 / 2 - 1)
+    assert _changes(step.T) == pytest.approx(-1)
+    noise = np.random.default_rng(0).normal(size=(400, 400))
+    assert _changes(noise) == pytest.approx(0, abs=0.02)
+
+
+def test_a_scan_that_is_no_grid_has_no_direction():
+    assert scan_direction(dataclasses.replace(CLEAN, scan_shape=None)) is None
+    mixed = np.random.default_rng(0).permutation(SIDE**2)
+    assert scan_direction(dataclasses.replace(CLEAN, scan_order=mixed)) is None
 
 
 def test_of_figure_4_is_told_what_its_file_lacks():
