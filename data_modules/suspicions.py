@@ -501,8 +501,8 @@ def scan_lines(capture: Capture) -> list[str]:
     times = found.along / max(found.across, 0.01)
     return [
         f"the light of bins without scene changes {times:.2g} times more along the lines of the scan than "
-        "across them: it seems to have been taken along the other axis; say so (scan_order=columns, or raster "
-        "where it is said to be columns), or effects that follow the scan are sought in the wrong order"
+        "across them: it seems to have been taken along the other axis; say so (scan_order=columns, or "
+        "raster where it says columns), or effects that follow the scan are sought in the wrong order"
     ]
 
 
