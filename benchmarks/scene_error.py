@@ -2,7 +2,7 @@
 
     python benchmarks/scene_error.py 2 4 21         development captures without effects
     python benchmarks/scene_error.py 2 truth=1      also scenes begun on the true surface
-    python benchmarks/scene_error.py 2 surfels.evenness=0 constant.surfels.fit.WORTH=0.5
+    python benchmarks/scene_error.py 2 surfels.evenness=0 constant.surfels.outlines.DIM=0.2
 
 Printed is one JSON line a scene: the Kullback-Leibler divergence of its expected counts from the true ones,
 in nats over the fitted and over the select spots. Noise has no part in it. What stands there is what a

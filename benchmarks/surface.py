@@ -3,7 +3,7 @@
     python benchmarks/surface.py draw=0,1,2 seeds=3            # effect-free scenes of curved bodies
     python benchmarks/surface.py known=bunny,z data=DIR        # simulated and rendered, with the true surface
     python benchmarks/surface.py scene=su path=FILE seeds=3 effects=wall_reflectance,irf_tail
-    python benchmarks/surface.py draw=1,2,9 surfels.bending=1 constant.surfels.fit.WORTH=0.5
+    python benchmarks/surface.py draw=1,2,9 surfels.bending=1 constant.surfels.outlines.DIM=0.2
 
 Settings of the fit and constants of ``nlos_lit`` can be changed, to see how much hangs on them. Prints one
 JSON line a fit. For drawn scenes the noise is the deviance of the same counts under the true expectation;
@@ -44,8 +44,8 @@ from nlos_lit.paper.methods import FAINTEST
 from nlos_lit.paper.subjects import SIZES, bunny, with_geometry
 from nlos_lit.paper.workspace import Subject, Workspace
 from nlos_lit.report.surface_figures import FrontImage, overview
-from nlos_lit.surfels.fit import SurfelSettings
-from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels, score_spots
+from nlos_lit.surfels.fit import SurfelSettings, score_spots
+from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels
 from nlos_lit.training.configs import compose, settings_of
 from nlos_lit.training.outcome import albedo_regions
 from nlos_lit.training.shown import spot_residuals

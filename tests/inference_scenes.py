@@ -165,7 +165,7 @@ def problem_of(
 def fit_of(
     model: SurfelModel, scene: Capture, extension: Extension | None = None, train: np.ndarray | None = None
 ) -> SurfelFit:
-    """A fit of ``train`` spots (all, where not given) as it stands: nothing is run."""
+    """A fit of ``train`` spots (all, where not given) as it stands: nothing is run. They judge it, too."""
     rows = np.arange(scene.n_spots) if train is None else train
     counts = torch.from_numpy(scene.gated_counts()[rows])
     generator = torch.Generator().manual_seed(0)
@@ -173,7 +173,7 @@ def fit_of(
     extension = Extension([]) if extension is None else extension
     nowhere = Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
     known = (model, scene, None, counts, torch.from_numpy(rows), SurfelSettings(), nowhere)
-    return SurfelFit(*known, extension, generator, order)
+    return SurfelFit(*known, extension, generator, order, torch.from_numpy(rows))
 
 
 def candidate(name: str, evidence: float = 100.0, lit: float = 1.0) -> Candidate:

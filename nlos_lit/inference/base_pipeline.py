@@ -60,7 +60,7 @@ class BasePipeline:
 
         Args:
             capture: raw counts.
-            split: whose ``fit`` spots are fitted.
+            split: whose ``fit`` spots are fitted; its ``select`` spots say how fine the scene may become.
             image: ``[nz, nx, ny]`` and its grid, from :meth:`image`.
             extension: effects, fitted along in place.
             seed: of batches and tested spots.
@@ -69,7 +69,7 @@ class BasePipeline:
             the fit, converged.
         """
         given = (capture, *image, replace(self.surfels, more=0), split.fit)
-        return fit_surfels(*given, extension=extension, seed=seed).fit
+        return fit_surfels(*given, extension=extension, seed=seed, judge_spots=split.select).fit
 
     def grow(self, fit: SurfelFit, seed: int) -> SurfelFit:
         """A parsimonious fit gone on with, with surfels as many and as fine as the counts ask for.

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from nlos_lit.inference.per_spot import all_neighbours, factors, own_part, sparse, spot_scores
 from nlos_lit.metrics.transients import Scores
-from nlos_lit.surfels.fit import SurfelFit
-from nlos_lit.surfels.fitted import score_spots
+from nlos_lit.surfels.fit import SurfelFit, score_spots
 
 BOOTSTRAP = 400
 

@@ -16,15 +16,15 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import Sheet
-from nlos_lit.metrics.transients import transient_scores
+from nlos_lit.metrics.transients import Scores, transient_scores
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import Seeds, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
 from nlos_lit.surfels.outlines import MEND, SEARCH, cut_back, extend, solve_albedos
 
 Progress = Callable[[int, int], None]
-WORTH = 0.02  # nats a parameter that another round must gain, or surfels that are divided
 PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "finer", "history", "losses")
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
@@ -40,9 +40,9 @@ class SurfelSettings:
             deviations.
         per_cell: seeds per lateral cell, so that partly hidden objects survive.
         max_seeds: the most significant are kept, and as many in reserve for growth.
-        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide while
-            sheets are found, and at most two while outlines are …
-        most: … where that makes no more surfels than this.
+        subdivide: surfels along each side of a voxel; None makes them at most four bins of path wide, and
+            finer where that predicts more …
+        most: … and makes no more surfels than this.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
         contest: batches in which seeds and response stand still, and albedos and effects are fitted.
         rounds: in which sheets are found; between them surfels die and grow one by one.
@@ -127,20 +127,19 @@ class Round:
     onward: bool = False
 
 
-def plan_from_seeds(settings: SurfelSettings, parts: int, finer: int, scan_shapes: bool) -> list[Round]:
+def plan_from_seeds(settings: SurfelSettings, parts: int, scan_shapes: bool) -> list[Round]:
     """The rounds from seeds to the fitted scene, without those that may follow.
 
     Args:
         settings: of the fit.
-        parts: into which each side of a seed is divided once the seeds have contested, …
-        finer: … and each side of what has become of them before outlines are found.
+        parts: into which each side of a seed is divided once the seeds have contested.
         scan_shapes: scanned parameters of effects are started after a first round of places.
 
     Returns:
         the plan, whose last round is twice as long.
 
     Examples:
-        >>> plan = plan_from_seeds(SurfelSettings(rounds=2, outlines=1), 1, 2, scan_shapes=False)
+        >>> plan = plan_from_seeds(SurfelSettings(rounds=2, outlines=1), 1, scan_shapes=False)
         >>> [(each.steps, each.left, each.grow, each.outline) for each in plan]
         [(150, 3, False, False), (100, 2, False, False), (100, 1, True, False), (200, 0, False, True)]
     """
@@ -149,7 +148,7 @@ def plan_from_seeds(settings: SurfelSettings, parts: int, finer: int, scan_shape
     plan.append(Round(s.steps, settling=True, parts=parts))
     coarse = max(s.rounds, 2) if scan_shapes else s.rounds
     plan += [Round(s.steps, grow=True, shapes=scan_shapes and k == 0) for k in range(coarse - 1)]
-    plan += [Round(s.steps, parts=1 if k else finer, outline=True) for k in range(s.outlines)]
+    plan += [Round(s.steps, outline=True)] * s.outlines
     plan[-1] = replace(plan[-1], steps=2 * s.steps)
     return [replace(each, left=len(plan) - 1 - k) for k, each in enumerate(plan)]
 
@@ -180,6 +179,8 @@ class SurfelFit:
         extension: effects that are fitted along, in place.
         generator: draws the batches.
         order: ``[N]`` permutation of the training rows, the first of which are used to test surfels.
+        judged: ``[J]`` rows of the capture that are not trained; by them it is judged how fine the surfels
+            are to be. Without any no rounds follow those of the plan.
 
     Attributes:
         done: batches so far.
@@ -201,11 +202,12 @@ class SurfelFit:
         extension: Extension,
         generator: torch.Generator,
         order: Tensor,
+        judged: Tensor,
     ) -> None:
         self.model, self.capture, self.grid, self.counts, self.train = model, capture, grid, counts, train
         self.settings, self.reserve, self.extension, self.generator = settings, reserve, extension, generator
         self.order, self.place, self.done = order, 0, 0
-        self.tested = order[: settings.test_spots]
+        self.tested, self.judged = order[: settings.test_spots], judged
         seen = capture.gated_observed()
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
@@ -229,13 +231,12 @@ class SurfelFit:
         model = copy.deepcopy(self.model)
         generator = torch.Generator().manual_seed(seed)
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
-        return SurfelFit(
-            model, *parts, extension, generator, torch.randperm(len(self.train), generator=generator)
-        )
+        order = torch.randperm(len(self.train), generator=generator)
+        return SurfelFit(model, *parts, extension, generator, order, self.judged)
 
     def parts(self) -> dict[str, Any]:
         """All that the fit is made of, for :meth:`of_parts`, which goes on from there to the last digit."""
-        names = ("capture", "grid", "counts", "train", "settings", "extension")
+        names = ("capture", "grid", "counts", "train", "settings", "extension", "judged")
         return {name: getattr(self, name) for name in names} | {"state": self.state()}
 
     @classmethod
@@ -310,6 +311,7 @@ class SurfelFit:
         self.model.to(device)
         self.extension.to(device)
         self.counts, self.train = self.counts.to(device), self.train.to(device)
+        self.judged = self.judged.to(device)
         if self.observed is not None:
             self.observed = self.observed.to(device)
         self.reserve = Seeds(*(part.to(device) for part in self.reserve))
@@ -342,9 +344,9 @@ class SurfelFit:
         """Say what is to be done next; it takes the place of what was.
 
         Last rounds of outlines are added while the fit is above the noise: bright captures take longer to
-        converge, and show finer detail. Each must gain ``WORTH`` a parameter, or is undone. Surfels are
-        divided in four before it where what is unexplained could be worth that to so many parameters. Where
-        that was undone they stay as they are, and where a round without it was, none follows.
+        converge, and show finer detail. Each must predict the judged spots better, or is undone. Surfels are
+        divided in four before it while they may be. Where that was undone they stay as they are, and where a
+        round without it was, none follows.
 
         Args:
             plan: the rounds.
@@ -355,22 +357,20 @@ class SurfelFit:
         self._add_round()
 
     def _add_round(self) -> None:
-        if self.plan or not (self.more or self.undo):
+        if self.plan or not len(self.judged) or not (self.more or self.undo):
             return
         deviance, noise = self._deviance()
-        worth = 2 * WORTH / self.counts.numel()  # of a parameter, in deviance
         tried, self.undo = self.undo, None
-        if tried is not None and self.before - deviance < worth * self._n_parameters():
+        if tried is not None and deviance >= self.before:
             deviance, cells = self.before, self.model.lateral.shape
             self._take_back(tried)
             divided = self.model.lateral.shape != cells
             self.finer, self.more = False, self.more if divided else 0
         if not self.more or deviance <= noise:
             return
-        s = self.settings
-        asked = deviance - noise >= worth * 8 * len(self.model)  # a place and an albedo of four times as many
-        wide = float(self.model.cell.max()) > FINEST * self.model.bin_length and 4 * len(self.model) <= s.most
-        self.plan = [Round(2 * s.steps, parts=2 if self.finer and asked and wide else 1, outline=True)]
+        s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
+        divide = self.finer and wide and 4 * len(self.model) <= s.most
+        self.plan = [Round(2 * s.steps, parts=2 if divide else 1, outline=True)]
         self.more, self.before = self.more - 1, deviance
         model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
         self.undo = copy.deepcopy({"model": model, "extension": extension})
@@ -380,10 +380,6 @@ class SurfelFit:
         self.model = SurfelModel.from_state(self.capture, undo["model"])
         self.extension.load_state_dict(undo["extension"])
         self.to(self.counts.device)
-
-    def _n_parameters(self) -> int:
-        others = [*self.model.laser_sensor.parameters(), *self.extension.parameters()]
-        return 2 * len(self.model) + sum(p.numel() for p in others)  # a place and an albedo each
 
     @property
     def finished(self) -> bool:
@@ -587,11 +583,30 @@ class SurfelFit:
 
     @torch.no_grad()
     def _deviance(self) -> tuple[float, float]:
-        """Per bin of the tested rows, and what noise alone would make."""
-        expected = self.model.expected(self.train[self.tested], self.extension)
-        seen = None if self.observed is None else self.observed[self.tested]
-        scores = transient_scores(self.counts[self.tested], expected, seen)
+        """Per bin of the judged spots, and what noise alone would make."""
+        scores = score_spots(self.model, self.capture, self.judged, self.extension)
         return scores.deviance_per_bin, scores.deviance_noise
+
+
+@torch.no_grad()
+def score_spots(model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hooks = NOTHING) -> Scores:
+    """Scores of some spots with their noise levels.
+
+    Args:
+        model: fitted surfels.
+        capture: whose gated counts are compared.
+        spots: ``[S]`` rows of the capture.
+        hooks: effects that act on the expected counts.
+
+    Returns:
+        means over the spots' gated bins.
+    """
+    first, last = capture.gate
+    rows = spots.cpu().numpy()
+    counts = torch.from_numpy(capture.counts[rows, first:last].astype(np.float32))
+    observed = capture.gated_observed()
+    seen = None if observed is None else torch.from_numpy(observed[rows])
+    return transient_scores(counts, model.expected(spots, hooks).cpu(), seen)
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:

@@ -16,12 +16,11 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.io.points import Points
-from nlos_lit.metrics.transients import Scores, transient_scores
+from nlos_lit.metrics.transients import Scores
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.fit import Progress, SurfelFit, SurfelSettings
+from nlos_lit.surfels.fit import Progress, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.start import seed_surfels
 
@@ -62,6 +61,7 @@ def fit_surfels(
     seed: int = 0,
     heldout_spots: np.ndarray | None = None,
     scan_shapes: bool = False,
+    judge_spots: np.ndarray | None = None,
 ) -> FittedSurfels:
     """Fit surfels and response to the counts of the training spots.
 
@@ -78,6 +78,7 @@ def fit_surfels(
         heldout_spots: ``[N']`` rows whose counts are only scored at the end; None scores nothing.
         scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
             them, instead of where they are; costs one round more.
+        judge_spots: ``[J]`` see :func:`~nlos_lit.surfels.start.seed_surfels`.
 
     Returns:
         the fitted model, scores and history.
@@ -88,7 +89,7 @@ def fit_surfels(
     """
     began = time.perf_counter()
     given = (capture, intensity, grid, settings, train_spots, laser_sensor_start, extension)
-    fit = seed_surfels(*given, seed=seed, scan_shapes=scan_shapes)
+    fit = seed_surfels(*given, seed=seed, scan_shapes=scan_shapes, judge_spots=judge_spots)
     fit.finish(progress)
     return fitted_surfels(fit, heldout_spots, began)
 
@@ -112,26 +113,6 @@ def fitted_surfels(fit: SurfelFit, heldout_spots: np.ndarray | None, began: floa
     parameters = {name: (p().item(), p.unit) for name, p in response if isinstance(p, BoundedParameter)}
     seconds = time.perf_counter() - began
     return FittedSurfels(model, fit.extension, fit, scores, parameters, fit.history, seconds)
-
-
-@torch.no_grad()
-def score_spots(model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hooks = NOTHING) -> Scores:
-    """Scores of some spots with their noise levels.
-
-    Args:
-        model: fitted surfels.
-        capture: whose gated counts are compared.
-        spots: ``[S]`` rows of the capture.
-        hooks: effects that act on the expected counts.
-
-    Returns:
-        means over the spots' gated bins.
-    """
-    first, last = capture.gate
-    counts = torch.from_numpy(capture.counts[spots.numpy(), first:last].astype(np.float32))
-    observed = capture.gated_observed()
-    seen = None if observed is None else torch.from_numpy(observed[spots.numpy()])
-    return transient_scores(counts, model.expected(spots, hooks), seen)
 
 
 @torch.no_grad()

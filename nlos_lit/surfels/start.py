@@ -20,8 +20,8 @@ from nlos_lit.surfels.model import Lateral, SurfelModel, points_along
 
 BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
 BYTES_KEPT = 24  # of a path while albedos are solved for: six numbers
-WIDEST = 4.0  # bins of path that a surfel's side spans at most while sheets are found …
-FINER = 2.0  # … and while outlines are
+WIDEST = 4.0  # bins of path that a surfel's side spans at most
+ASIDE = 10  # one of so many training spots judges how fine surfels are to be
 RESERVE = 0.4  # maxima down to this share of the floor are kept in reserve for growth
 
 
@@ -35,6 +35,7 @@ def seed_surfels(
     extension: Extension | None = None,
     seed: int = 0,
     scan_shapes: bool = False,
+    judge_spots: np.ndarray | None = None,
 ) -> SurfelFit:
     """Surfels at the significant maxima of an image, with a response that matches the energy.
 
@@ -49,6 +50,8 @@ def seed_surfels(
         seed: of batches and tested spots.
         scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
             them, instead of where they are; costs one round more.
+        judge_spots: ``[J]`` rows that are not trained, by which it is judged how fine the surfels are to be.
+            None sets a tenth of the training spots aside for it, where that is asked (``settings.more``).
 
     Returns:
         a fit with all its rounds ahead.
@@ -64,7 +67,8 @@ def seed_surfels(
         )
     s, extension = settings, Extension([]) if extension is None else extension
     intensity = intensity.detach().cpu().float()
-    train = torch.as_tensor(np.asarray(train_spots), dtype=torch.long)
+    train, judged = _apart(train_spots, seed, s.more) if judge_spots is None else (train_spots, judge_spots)
+    train, judged = (torch.as_tensor(np.asarray(rows), dtype=torch.long) for rows in (train, judged))
     first, last = capture.gate
     counts = torch.from_numpy(capture.counts[train.numpy(), first:last].astype(np.float32))
     if counts.sum() == 0:
@@ -103,16 +107,21 @@ def seed_surfels(
     model.set_passing(0.5)
     widest = float(model.cell.max()) / capture.bin_length  # bins
     parts = s.subdivide or math.ceil(widest / WIDEST)
-    finer = 1 if s.subdivide else math.ceil(widest / parts / FINER)
     points = s.quadrature or points_along(float(model.cell.max()) / parts, capture.bin_length)
     a_spot = len(model) * (parts * points) ** 2  # paths
     step_bytes = a_spot * max(min(s.batch, len(train)) * BYTES_PER_PATH, len(tested) * BYTES_KEPT)
     smaller = "take fewer surfels (surfels.max_seeds) or fewer spots (surfels.batch, surfels.test_spots)"
     check_machine(step_bytes + 8 * counts.numel(), "one step of the surface fit", smaller)
-    fit = SurfelFit(
-        model, capture, grid, counts, train, s, candidates.take(best), extension, generator, order
-    )
+    reserve = candidates.take(best)
+    fit = SurfelFit(model, capture, grid, counts, train, s, reserve, extension, generator, order, judged)
     fit.match_energy()
     scan_shapes = scan_shapes and any(effect.shapes for effect in extension.effects)
-    fit.schedule(plan_from_seeds(s, parts, finer, scan_shapes), s.more)
+    fit.schedule(plan_from_seeds(s, parts, scan_shapes), s.more)
     return fit
+
+
+def _apart(spots: np.ndarray, seed: int, more: int) -> tuple[np.ndarray, np.ndarray]:
+    """Training spots, and those of them that are set aside where rounds may follow those of the plan."""
+    number = len(spots) // ASIDE if more else 0
+    mixed = np.random.default_rng(seed).permutation(spots)
+    return np.sort(mixed[number:]), np.sort(mixed[:number])

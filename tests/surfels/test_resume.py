@@ -34,7 +34,7 @@ def begun() -> SurfelFit:
     fit.settings, fit.tested = SETTINGS, fit.order[:50]
     fit.grid = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
     fit.reserve = Seeds(torch.tensor([[0.0, 0.0, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
-    fit.schedule(plan_from_seeds(SETTINGS, 2, 2, scan_shapes=True), SETTINGS.more)
+    fit.schedule(plan_from_seeds(SETTINGS, 2, scan_shapes=True), SETTINGS.more)
     return fit
 
 
@@ -135,19 +135,19 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
 def test_a_plan_is_the_rounds_in_order():
     settings = dataclasses.replace(SETTINGS, rounds=2, outlines=2, steps=10, contest=7)
     contest = Round(7, left=4, settling=True, contest=True)
-    assert plan_from_seeds(settings, 2, 3, scan_shapes=False) == [
+    assert plan_from_seeds(settings, 2, scan_shapes=False) == [
         contest,
         Round(10, left=3, settling=True, parts=2),
         Round(10, left=2, grow=True),
-        Round(10, left=1, parts=3, outline=True),
+        Round(10, left=1, outline=True),
         Round(20, outline=True),
     ]
     bare = dataclasses.replace(settings, outlines=0, contest=0)
-    assert plan_from_seeds(bare, 1, 2, scan_shapes=True) == [
+    assert plan_from_seeds(bare, 1, scan_shapes=True) == [
         Round(10, left=1, settling=True),
         Round(20, grow=True, shapes=True),
     ]
-    assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, 2, scan_shapes=True)) == 2
+    assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, scan_shapes=True)) == 2
 
 
 def test_seeds_stand_still_while_they_contest_and_faint_ones_go():

@@ -23,7 +23,8 @@ from nlos_lit.io.points import read_points
 from nlos_lit.metrics.excess import Excess
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.runtime.command_line import quiet_libraries
-from nlos_lit.surfels.fitted import fitted_surfels, score_spots
+from nlos_lit.surfels.fit import score_spots
+from nlos_lit.surfels.fitted import fitted_surfels
 from nlos_lit.training.callbacks import History, ScoreHeldout
 from nlos_lit.training.configs import compose
 from nlos_lit.training.origin import START, finished_checkpoint

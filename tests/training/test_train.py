@@ -22,7 +22,7 @@ from nlos_lit.effects.strengths import report
 from nlos_lit.io.points import read_points
 from nlos_lit.io.views import read_view
 from nlos_lit.io.volumes import read_volume
-from nlos_lit.surfels.fitted import score_spots
+from nlos_lit.surfels.fit import score_spots
 from nlos_lit.training.configs import compose
 from nlos_lit.training.run_folder import open_run, prepare_run
 from nlos_lit.training.surface_run import load_refined
