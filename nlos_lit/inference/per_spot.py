@@ -112,7 +112,8 @@ def own_part(
         both, ``[S]``; as they are without neighbours.
     """
     parts = [over_mean(score, information, each, own) for each in near] or [(score, information)]
-    return min(parts, key=lambda part: best_width(*part, positive)[0]) if len(parts) > 1 else parts[0]
+    gains = [best_width(s, f, positive)[0] for s, f in parts] if len(parts) > 1 else [0.0]
+    return parts[gains.index(min(gains))]
 
 
 def over_mean(

@@ -67,8 +67,8 @@ def seed_surfels(
         )
     s, extension = settings, Extension([]) if extension is None else extension
     intensity = intensity.detach().cpu().float()
-    train, judged = _apart(train_spots, seed, s.more) if judge_spots is None else (train_spots, judge_spots)
-    train, judged = (torch.as_tensor(np.asarray(rows), dtype=torch.long) for rows in (train, judged))
+    apart = _apart(train_spots, seed, s.more) if judge_spots is None else (train_spots, judge_spots)
+    train, judged = (torch.as_tensor(np.asarray(rows), dtype=torch.long) for rows in apart)
     first, last = capture.gate
     counts = torch.from_numpy(capture.counts[train.numpy(), first:last].astype(np.float32))
     if counts.sum() == 0:
