@@ -211,7 +211,7 @@ class SurfelFit:
         seen = capture.gated_observed()
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
-        self.more, self.before = 0, math.inf  # rounds that may follow; the deviance before the latest of them
+        self.more, self.before = 0, torch.zeros(0)  # rounds that may follow; nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
         self.finer = True  # surfels may be divided before one of them
         self.history: list[dict[str, float]] = []
@@ -344,34 +344,34 @@ class SurfelFit:
         """Say what is to be done next; it takes the place of what was.
 
         Last rounds of outlines are added while the fit is above the noise: bright captures take longer to
-        converge, and show finer detail. Each must predict the judged spots better, or is undone. Surfels are
-        divided in four before it while they may be. Where that was undone they stay as they are, and where a
-        round without it was, none follows.
+        converge, and show finer detail. Each must predict the judged spots better by more than the standard
+        error of it, or is undone. Surfels are divided in four before it while they may be. Where that was
+        undone they stay as they are, and where a round without it was, none follows.
 
         Args:
             plan: the rounds.
             more: last rounds that may be added, at most.
         """
-        self.plan, self.more, self.before = list(plan), more, math.inf
+        self.plan, self.more = list(plan), more
         self.undo, self.finer = None, self.settings.subdivide is None
         self._add_round()
 
     def _add_round(self) -> None:
         if self.plan or not len(self.judged) or not (self.more or self.undo):
             return
-        deviance, noise = self._deviance()
+        nats, above_noise = self._predicted()
         tried, self.undo = self.undo, None
-        if tried is not None and deviance >= self.before:
-            deviance, cells = self.before, self.model.lateral.shape
+        if tried is not None and not _better(nats, self.before):
+            nats, above_noise, cells = self.before, True, self.model.lateral.shape
             self._take_back(tried)
             divided = self.model.lateral.shape != cells
             self.finer, self.more = False, self.more if divided else 0
-        if not self.more or deviance <= noise:
+        if not self.more or not above_noise:
             return
         s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
         divide = self.finer and wide and 4 * len(self.model) <= s.most
         self.plan = [Round(2 * s.steps, parts=2 if divide else 1, outline=True)]
-        self.more, self.before = self.more - 1, deviance
+        self.more, self.before = self.more - 1, nats
         model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
         self.undo = copy.deepcopy({"model": model, "extension": extension})
 
@@ -582,10 +582,18 @@ class SurfelFit:
         return self.finish()
 
     @torch.no_grad()
-    def _deviance(self) -> tuple[float, float]:
-        """Per bin of the judged spots, and what noise alone would make."""
-        scores = score_spots(self.model, self.capture, self.judged, self.extension)
-        return scores.deviance_per_bin, scores.deviance_noise
+    def _predicted(self) -> tuple[Tensor, bool]:
+        """``[J]`` nats of the judged spots, and whether more than noise is left there."""
+        counts, expected, seen = _beside(self.model, self.capture, self.judged, self.extension)
+        scores = transient_scores(counts, expected, seen)
+        nats = (torch.xlogy(counts, expected.clamp_min(1e-9)) - expected).double().sum(1)
+        return nats, scores.deviance_per_bin > scores.deviance_noise
+
+
+def _better(nats: Tensor, before: Tensor) -> bool:
+    """Whether spots are likelier by more than the standard error that they leave of it."""
+    gain = nats - before
+    return float(gain.sum()) > math.sqrt(len(gain)) * float(gain.std(correction=0))
 
 
 @torch.no_grad()
@@ -601,12 +609,19 @@ def score_spots(model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hook
     Returns:
         means over the spots' gated bins.
     """
+    return transient_scores(*_beside(model, capture, spots, hooks))
+
+
+def _beside(
+    model: SurfelModel, capture: Capture, spots: Tensor, hooks: Hooks
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Gated counts, expected ones, and which were observed, where some were not."""
     first, last = capture.gate
     rows = spots.cpu().numpy()
     counts = torch.from_numpy(capture.counts[rows, first:last].astype(np.float32))
     observed = capture.gated_observed()
     seen = None if observed is None else torch.from_numpy(observed[rows])
-    return transient_scores(counts, model.expected(spots, hooks).cpu(), seen)
+    return counts, model.expected(spots, hooks).cpu(), seen
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:

@@ -14,7 +14,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import level_of
-from nlos_lit.surfels.fit import FINEST, Round, SurfelFit, SurfelSettings
+from nlos_lit.surfels.fit import FINEST, Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.outlines import DIM, RINGS, SEARCH, cut_back, extend, solve_albedos
 
@@ -172,8 +172,8 @@ def test_a_sheet_that_is_known_in_part_comes_out_whole_and_no_larger():
 
 def test_outlines_reach_the_noise_from_a_part_and_go_on_to_the_digit():
     fit, again = outlined(2), outlined(2)
-    deviance, noise = fit._deviance()
-    assert deviance < 1.03 * noise
+    scores = score_spots(fit.model, fit.capture, fit.train, fit.extension)
+    assert scores.deviance_per_bin < 1.03 * scores.deviance_noise
     assert all(
         torch.equal(v, w) for v, w in zip(fit.model.parameters(), again.model.parameters(), strict=True)
     )
@@ -194,7 +194,7 @@ def waiting(change: dict | None = None) -> SurfelFit:
 )
 def test_surfels_are_divided_where_they_may_be(monkeypatch, change, parts):
     fit = waiting(change)
-    monkeypatch.setattr(fit, "_deviance", lambda: (9.0, 0.7))
+    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
     fit.schedule([], 1)
     assert [each.parts for each in fit.plan] == [parts]
 
@@ -203,26 +203,27 @@ def test_surfels_are_divided_where_they_may_be(monkeypatch, change, parts):
 def test_surfels_that_are_narrow_enough_are_not_divided(monkeypatch, wide, parts):
     fit = waiting()
     fit.model.cell = torch.full((2,), wide * FINEST * WALL.bin_length)
-    monkeypatch.setattr(fit, "_deviance", lambda: (9.0, 0.7))
+    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
     fit.schedule([], 1)
     assert [each.parts for each in fit.plan] == [parts]
 
 
 @pytest.mark.parametrize("divided", [True, False])
-@pytest.mark.parametrize(("gain", "stays"), [(0.0, False), (0.001, True)])
+@pytest.mark.parametrize(("gain", "stays"), [(0.49, False), (0.51, True)])
 def test_a_round_that_predicts_nothing_better_is_undone(monkeypatch, divided, gain, stays):
     fit = waiting({} if divided else {"subdivide": 1})
-    monkeypatch.setattr(fit, "_deviance", lambda: (9.0, 0.7))
+    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
     fit.schedule([], 3)
     before = {name: v.clone() for name, v in fit.model.state_dict().items() if torch.is_tensor(v)}
 
-    def after() -> tuple[float, float]:
-        return 9.0 - gain, 0.7
+    def after() -> tuple[torch.Tensor, bool]:
+        """Four spots whose gains scatter by 1: their mean's standard error is a half."""
+        return gain + torch.tensor([-1.0, -1.0, 1.0, 1.0]), True
 
     fit.begin_round()
     assert float(fit.model.cell.max()) == pytest.approx(CELL / 2 if divided else CELL)
     fit.step(), fit.step()
-    monkeypatch.setattr(fit, "_deviance", after)
+    monkeypatch.setattr(fit, "_predicted", after)
     fit.end_round()
     now = fit.model.state_dict()
     kept = all(now[n].shape == v.shape and torch.equal(now[n], v) for n, v in before.items())

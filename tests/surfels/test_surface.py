@@ -162,10 +162,10 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
 def test_nothing_follows_where_judged_spots_are_at_the_noise_or_there_are_none(fitted, monkeypatch):
     fit = fitted[-1].fit.copy(Extension([]), 0)
     fit.judged = torch.arange(3)
-    for deviance, rounds in ((0.69, 0), (0.71, 1)):
-        monkeypatch.setattr(fit, "_deviance", lambda now=deviance: (now, 0.7))
+    for above_noise in (False, True):
+        monkeypatch.setattr(fit, "_predicted", lambda now=above_noise: (torch.zeros(3), now))
         fit.schedule([], 4)
-        assert len(fit.plan) == rounds
+        assert len(fit.plan) == above_noise
     fit.judged = torch.arange(0)
     fit.schedule([], 4)
     assert fit.finished
