@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nlos_lit.inference.per_spot import all_neighbours, factors, own_part, sparse, spot_scores
+from nlos_lit.inference.per_spot import factors, neighbours, own_part, sparse, spot_scores
 from nlos_lit.metrics.transients import Scores
 from nlos_lit.surfels.fit import SurfelFit, score_spots
 
@@ -49,8 +49,8 @@ def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
     for effect in fit.extension.effects:
         if effect.per_spot:
             score, information, _ = spot_scores(fit.model, fit.extension, effect, index, counts)
-            near = all_neighbours(fit.model, effect, index)
-            score, information = own_part(score, information, near, sparse(effect))
+            if not effect.in_runs:
+                score, information = own_part(score, information, neighbours(fit.model, index))
             value += factors(score, information, effect.width, effect.share, sparse(effect))
     return value
 

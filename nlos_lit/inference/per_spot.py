@@ -11,15 +11,13 @@ what does not depend on σ (Laplace; exact for Gaussian counts),
 
 So spots that no fit saw still say whether the width is right.
 
-Where coefficients are independent of each other, what a spot shares with its neighbours on the wall, or with
-the spots before and after it, is none of its own, but the scene's, or another term's. It is taken off first,
-:func:`own_part`: over those neighbours beside which least is left to explain.
+Where coefficients are independent of each other, what a spot shares with its neighbours on the wall is none
+of its own, but the scene's, or another term's. It is taken off first, :func:`own_part`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from scipy.optimize import minimize_scalar
@@ -33,7 +31,7 @@ from nlos_lit.inference.problem import effect_columns
 from nlos_lit.surfels.model import SurfelModel
 
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
-NEIGHBOURS = 8  # of a spot, on the wall or before and after it: over their mean stands what is its own
+NEIGHBOURS = 8  # of a spot on the wall: over their mean stands what is its own
 
 
 def sparse(effect: Effect) -> bool:
@@ -59,64 +57,7 @@ def neighbours(scan: SurfelModel | Capture, spots: Tensor) -> Tensor:
     return near.gather(1, itself.int().argsort(stable=True, dim=1))[:, :number]
 
 
-def before_and_after(rank: Tensor) -> Tensor:
-    """Which spots were taken just before and after each.
-
-    Args:
-        rank: ``[S]`` that rises in the order of acquisition.
-
-    Returns:
-        ``[S, K]`` places in ``rank``, of ``NEIGHBOURS`` spots, half of them before where there are so many,
-        or of all there are.
-    """
-    order = torch.argsort(rank)
-    spots, number = torch.arange(len(rank))[:, None], min(NEIGHBOURS, len(rank) - 1)
-    window = (spots - number // 2).clamp(0, len(rank) - 1 - number) + torch.arange(number + 1)
-    near = torch.empty(len(rank), number, dtype=torch.long)
-    near[order] = order[window[window != spots].view(len(rank), number)]
-    return near
-
-
-def all_neighbours(scan: SurfelModel, effect: Effect, spots: Tensor) -> list[Tensor]:
-    """All that a spot's coefficient is held against.
-
-    Args:
-        scan: what knows the spots' laser and sensor points.
-        effect: that knows the order of acquisition.
-        spots: ``[S]`` rows of the capture.
-
-    Returns:
-        ``[S, K]`` neighbours on the wall, and before and after; none where they may share their numbers.
-    """
-    return [] if effect.in_runs else [neighbours(scan, spots), before_and_after(effect.scan.rank[spots])]
-
-
 def own_part(
-    score: Tensor,
-    information: Tensor,
-    near: Sequence[Tensor],
-    positive: bool,
-    own: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Score and information of what spots' coefficients have over their neighbours'.
-
-    Args:
-        score: ``[S]`` of the whole coefficients at 0.
-        information: ``[S]`` of them.
-        near: from :func:`all_neighbours`; where there are several kinds those beside which spots have least
-            evidence of their own.
-        positive: coefficients are half normal and sparse.
-        own: ``[S]`` what is known of the neighbours' own parts, see :func:`over_mean`.
-
-    Returns:
-        both, ``[S]``; as they are without neighbours.
-    """
-    parts = [over_mean(score, information, each, own) for each in near] or [(score, information)]
-    gains = [best_width(s, f, positive)[0] for s, f in parts] if len(parts) > 1 else [0.0]
-    return parts[gains.index(min(gains))]
-
-
-def over_mean(
     score: Tensor, information: Tensor, near: Tensor, own: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Score and information of what a spot's coefficient has over the mean of its neighbours'.
@@ -135,7 +76,7 @@ def over_mean(
         Three spots of 5, 5 and 8, each measured to ±1: the last has 3 of its own, to ±√1.5.
 
         >>> near = torch.tensor([[1, 2], [0, 2], [0, 1]])
-        >>> score, information = over_mean(torch.tensor([5.0, 5.0, 8.0]), torch.ones(3), near)
+        >>> score, information = own_part(torch.tensor([5.0, 5.0, 8.0]), torch.ones(3), near)
         >>> (score / information).tolist(), round(float(information[2]), 3)
         ([-1.5, -1.5, 3.0], 0.667)
     """
@@ -272,12 +213,13 @@ def solve(
     """
     p = effect.amplitudes[0]
     raw = getattr(effect, f"raw_{p.name}")
-    near, positive = all_neighbours(model, effect, spots), sparse(effect)
+    near = None if effect.in_runs else neighbours(model, spots)
     for _ in range(rounds):
         score, information, _ = spot_scores(model, extension, effect, spots, counts)
         own = raw[spots].double()
         score = score + information * own  # that a start at 0 would have had
-        score, information = own_part(score, information, near, positive, own)
-        _, effect.width, effect.share = best_width(score, information, positive)
-        raw[spots] = coefficients(score, information, effect.width, positive).float()
+        if near is not None:
+            score, information = own_part(score, information, near, own)
+        _, effect.width, effect.share = best_width(score, information, sparse(effect))
+        raw[spots] = coefficients(score, information, effect.width, sparse(effect)).float()
         effect.clamp()

@@ -27,7 +27,7 @@ from nlos_lit.inference.evidence import (
     prior_deviations,
     step_bounds,
 )
-from nlos_lit.inference.per_spot import all_neighbours, best_width, coefficients, own_part, sparse
+from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.fit import SurfelFit
@@ -501,8 +501,8 @@ def _scores(
     scatter = spot_scatter(column, residual)
     if at is not None:
         score = score + information * at
-    near = all_neighbours(problem.model, effect, problem.spots)
-    score, information = own_part(score, information, near, sparse(effect))
+    if not effect.in_runs:
+        score, information = own_part(score, information, neighbours(problem.model, problem.spots))
     return score / scatter, information / scatter, scatter
 
 

@@ -16,13 +16,10 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.per_spot import (
-    all_neighbours,
-    before_and_after,
     best_width,
     coefficients,
     factors,
     neighbours,
-    over_mean,
     own_part,
     solve,
     sparse,
@@ -124,8 +121,7 @@ def test_solve_finds_the_hot_spots_and_no_others():
     # Newton steps have come to rest at what the spots have over their neighbours.
     score, information, _ = spot_scores(model, Extension([effect]), effect, train, counts[train])
     own = effect.raw_extra.detach()[train].double()
-    near = all_neighbours(model, effect, train)
-    around, its = own_part(score + information * own, information, near, True, own)
+    around, its = own_part(score + information * own, information, neighbours(model, train), own)
     left = (around - its * own)[(train == 5) | (train == 40)]
     assert bool((left.abs() < 0.05 * its[(train == 5) | (train == 40)].sqrt()).all())
     assert 0.01 <= effect.share <= 0.1
@@ -214,55 +210,9 @@ def test_what_is_smooth_over_the_wall_is_no_spots_own():
     inner = ((x > 1) & (x < 30) & (y > 1) & (y < 30)).ravel()
     noise = 0.2 * (9 / 8) ** 0.5
     for known, width, other in ((None, 0.5 * (9 / 8) ** 0.5, 0.5 / 8**0.5), (own, 0.5, 0.0)):
-        s, f = over_mean(score, information, near, known)
+        s, f = own_part(score, information, near, known)
         found = best_width(s[inner], f[inner], False)[1]
         assert found == pytest.approx(width, rel=0.05)
         delays = coefficients(s, f, found, False)[inner]
         expected = 0.5 / (0.5**2 + noise**2 + other**2) ** 0.5
         assert np.corrcoef(delays, own[inner])[0, 1] == pytest.approx(expected, abs=0.02)
-
-
-def test_before_and_after_are_the_nearest_in_time():
-    rank = torch.tensor([3, 0, 11, 1, 7, 2, 5, 9, 4, 6, 10, 8])
-    near = before_and_after(rank)
-    assert near.shape == (12, 8)
-    for k in range(12):
-        first = min(max(int(rank[k]) - 4, 0), 3)
-        assert sorted(rank[near[k]].tolist()) == [r for r in range(first, first + 9) if r != rank[k]]
-    assert before_and_after(torch.tensor([2.0, 0.5, 1.0])).sort(1).values.tolist() == [[1, 2], [0, 2], [0, 1]]
-    assert before_and_after(torch.tensor([2.0])).shape == (1, 0)
-
-
-def on_a_grid(side):
-    """Both kinds of neighbours in a raster scan, those on the wall alone first."""
-    grid = np.indices((side, side)).reshape(2, -1).T.astype(np.float64)
-    places = torch.from_numpy(np.pad(grid, ((0, 0), (0, 1))))
-    spots = torch.arange(side**2)
-    wall = neighbours(SimpleNamespace(laser=places, sensor=places), spots)
-    return [wall], [wall, before_and_after(spots)]
-
-
-def test_what_spots_share_with_those_before_and_after_is_not_their_own():
-    """A lamp that is on for 16 spots of a line each time, and three spots that are hot by themselves: beside
-    neighbours on the wall alone the lamp's spots stand out, too.
-    """
-    level = np.zeros((32, 32))
-    level[[4, 10, 17, 26], 8:24] = 8.0
-    hot = [20 * 32 + 20, 6 * 32 + 2, 30 * 32 + 30]
-    level.ravel()[hot] = 8.0
-    score = torch.from_numpy(level.ravel() + np.random.default_rng(7).standard_normal(1024))
-    found = [own_part(score, torch.ones_like(score), near, True) for near in on_a_grid(32)]
-    wall, both = (torch.nonzero(coefficients(s, f, 1.0, True))[:, 0].tolist() for s, f in found)
-    assert len(wall) > 40
-    assert set(hot) <= set(both)
-    assert len(both) <= len(hot) + 8 * 2, "the ends of the lamp's stretches"
-    assert best_width(*found[1], True)[0] < 0.3 * best_width(*found[0], True)[0]
-
-
-def test_delays_of_each_spots_own_keep_their_evidence():
-    rng = np.random.default_rng(8)
-    information = torch.full((1024,), 4.0, dtype=torch.float64)
-    score = information * torch.from_numpy(rng.standard_normal(1024) + 0.5 * rng.standard_normal(1024))
-    one, two = (best_width(*own_part(score, information, near, False), False) for near in on_a_grid(32))
-    assert one[0] >= two[0] > 0.9 * one[0] > 1000
-    assert two[1] == pytest.approx((9 / 8) ** 0.5, rel=0.05)
