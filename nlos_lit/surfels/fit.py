@@ -74,7 +74,7 @@ class SurfelSettings:
     rounds: int = 3
     outlines: int = 3
     steps: int = 100
-    more: int = 4
+    more: int = 8
     batch: int = 24
     depth_rate: float = 0.15
     albedo_rate: float = 0.08
