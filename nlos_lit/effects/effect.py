@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,15 @@ from nlos_lit.effects.parameter import Number, Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
 
 STAGES = ("path", "time", "response", "spot", "counting")
+
+
+class Asked(NamedTuple):
+    """What the counts ask of the light of B spots over M surfels, in units of counting noise."""
+
+    spots: Tensor  # [B] rows of the scan
+    centre: Tensor  # [M, 3] m, of the surfels
+    excess: Tensor  # [B, M] gain in likelihood, nats, of leaving out a small share of a path's light, by it
+    light: Tensor  # [B, M] light of each path, by the noise where it arrives
 
 
 class Effect(nn.Module, Hooks):
@@ -181,6 +190,17 @@ class Effect(nn.Module, Hooks):
         for p in self.shapes:
             combinations = [{**c, p.name: v} for c in combinations for v in p.grid]
         return combinations
+
+    def likely_shapes(self, asked: Asked) -> list[dict[str, float]]:
+        """Shapes that are worth a test; the whole grid, where an effect does not know better.
+
+        Args:
+            asked: what the counts ask of each path's light.
+
+        Returns:
+            as of :meth:`shape_grid`.
+        """
+        return self.shape_grid()
 
     def quantities(self) -> dict[str, Quantity]:
         """What is reported: every scalar parameter; effects with coefficients override this."""

@@ -30,6 +30,7 @@ from nlos_lit.inference.evidence import (
 from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.split import Split
+from nlos_lit.surfels.effect_start import asked_of
 from nlos_lit.surfels.fit import SurfelFit
 
 MOST = 0.9  # of the largest evidence or gain: a simpler term with so much goes before that with the largest
@@ -449,7 +450,7 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
     Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what
     costs. So shapes are ranked by the score over the unprojected information.
     """
-    shapes, ranked = effect.shape_grid(), []
+    shapes, ranked = _shapes(problem, projector, effect), []
     for shape in shapes:
         effect.set_all(shape)
         z = weighted_columns(problem, effect)
@@ -465,6 +466,15 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
         effect.set_all(shape)
         kept.append((shape, weighted_columns(problem, effect) if known is None else known))
     return kept
+
+
+def _shapes(problem: Problem, projector: Projector, effect: Effect) -> list[Shape]:
+    """Those that the effect itself thinks likely."""
+    if not effect.needs_paths or not effect.shapes:
+        return effect.shape_grid()
+    excess = projector.residual[: problem.expected.numel()].view_as(problem.expected)
+    asked = asked_of(problem.model, problem.extension, problem.spots, excess, problem.expected)
+    return effect.likely_shapes(asked)
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:

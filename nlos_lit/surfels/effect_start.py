@@ -5,9 +5,40 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.effect import Asked, Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.surfels.model import SurfelModel
+
+
+def asked_of(
+    model: SurfelModel, extension: Extension, spots: Tensor, excess: Tensor, expected: Tensor
+) -> Asked:
+    """What the counts ask of the light of each path.
+
+    Args:
+        model: the surfels.
+        extension: effects.
+        spots: ``[B]`` rows of the capture.
+        excess: ``[B, T_gate]`` counts over the expected ones, by the noise.
+        expected: ``[B, T_gate]``.
+
+    Returns:
+        from one pass back through the model for all paths together.
+    """
+    noise = expected.rsqrt()
+    found = []
+    for part, pull, unit in zip(spots.split(32), (excess * noise).split(32), noise.split(32), strict=True):
+        with torch.no_grad():
+            paths = model.paths(part)
+        light = paths.contribution.requires_grad_()
+        rendered = model.record(model.transients(paths, part, extension), part, extension)
+        rendered = rendered[:, model.gate[0] :]
+        by = [
+            torch.autograd.grad((rendered * w).sum(), light, retain_graph=w is pull)[0] for w in (pull, unit)
+        ]
+        found.append(torch.stack([(light.detach() * g).sum(2) for g in by]))
+    score, amount = torch.cat(found, 1)
+    return Asked(spots, model.centre().detach(), -score, amount)
 
 
 @torch.no_grad()
@@ -41,8 +72,10 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
         base = expected(effect, light)
         nulls = {p.name: p.null or 0.0 for p in effect.amplitudes}
         excess = counts / base - 1
+        with torch.enable_grad():
+            asked = asked_of(model, extension, spots, excess * base.sqrt(), base)
         best, most = {}, 0.0
-        for shape in effect.shape_grid():
+        for shape in effect.likely_shapes(asked):
             effect.set_all(shape)
             columns = []
             for p in effect.amplitudes:

@@ -10,6 +10,8 @@ import torch
 from effect_contract import SPOTS, scene
 from effect_hand import ONE, SPOT, effect, hand_paths, hand_scan
 
+from nlos_lit.effects.effect import Asked
+
 
 def test_retroreflection_turns_the_fourth_power_into_the_second():
     retro = effect("retroreflection", falloff=2.0, cosine=1.0)
@@ -50,6 +52,31 @@ def test_occlusion_blocks_legs_that_cross_the_disc():
     assert both.path(ONE, hand_paths(), SPOT).item() == pytest.approx(0.16, abs=1e-3)
     both.set("y", 0.1)
     assert both.path(ONE, hand_paths(), SPOT).item() == pytest.approx(0.7**2, abs=1e-3)
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+@pytest.mark.parametrize(("x", "y"), [(0.22, -0.13), (-0.47, 0.0)])
+def test_the_disc_is_looked_for_where_legs_lose_light(confocal, x, y):
+    """Of each depth and radius the best place; at the true depth and radius within a cell of the true one."""
+    line = torch.linspace(-0.5, 0.5, 14)
+    wall = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1))
+    other = wall if confocal else wall[:1].expand(len(wall), 3)
+    scan = hand_scan(wall.tolist(), None if confocal else other.tolist())
+    disc = effect("occlusion", scan=scan, opacity=0.3)
+    z, radius = (disc.declared[name].grid[2] for name in ("z", "radius"))
+    disc.set_all({"x": x, "y": y, "z": z, "radius": radius})
+    line = torch.linspace(-0.6, 0.6, 11)
+    centre = torch.nn.functional.pad(torch.cartesian_prod(line, line), (0, 1), value=1.3)
+    lost = 2 - sum(disc.transmission(points, centre) for points in (wall, other)).detach()
+    asked = Asked(torch.arange(len(wall)), centre, lost, torch.ones_like(lost))
+    found = disc.likely_shapes(asked)
+    assert len(found) == 20
+    (best,) = (s for s in found if (s["z"], s["radius"]) == (z, radius))
+    cell = disc.declared["radius"].grid[0] / 2
+    assert (best["x"], best["y"]) == pytest.approx((x, y), abs=cell)
+    # Behind everything no disc hides anything: what is asked for there does not matter.
+    nothing = disc.likely_shapes(asked._replace(centre=centre * torch.tensor([1.0, 1.0, 0.01])))
+    assert len(nothing) == 20
 
 
 def test_wall_tilt_shortens_legs():

@@ -19,10 +19,11 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.hooks import Hooks
 from nlos_lit.functional.surfel_graph import brightness, level_of
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels import start
-from nlos_lit.surfels.effect_start import choose_shapes
+from nlos_lit.surfels.effect_start import asked_of, choose_shapes
 from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels
 from nlos_lit.surfels.growth import (
@@ -230,6 +231,49 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
     assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
     assert leak.value("amplitude").item() < 0.02
     assert wall.value("gain_map").abs().max() == 0
+
+
+def test_what_is_asked_of_a_path_is_what_leaving_it_out_gains(fitted):
+    """Beside finite differences: half of one surfel's light at one spot is left out."""
+    result = fitted[-1]
+    model, spots = result.model, torch.tensor([3, 11, 40])
+    expected = model.expected(spots, Extension([]))
+    counts = torch.poisson(1.1 * expected, generator=torch.Generator().manual_seed(0))
+    noise = expected.sqrt()
+    asked = asked_of(model, Extension([]), spots, (counts - expected) / noise, expected)
+
+    class Less(Hooks):
+        def path(self, contribution, paths, which):
+            lost = torch.zeros_like(contribution)
+            lost[1, surfel] = 0.5
+            return contribution * (1 - lost)
+
+    for surfel in asked.light[1].topk(3).indices.tolist():
+        less = model.expected(spots, Less())
+        gain = ((counts / expected - 1) * (less - expected)).sum() / 0.5
+        assert asked.excess[1, surfel].item() == pytest.approx(gain.item(), rel=2e-3, abs=1e-3)
+        light = ((expected - less) / noise).sum() / 0.5
+        assert asked.light[1, surfel].item() == pytest.approx(light.item(), rel=2e-3)
+
+
+def test_a_disc_that_hides_is_found(fitted):
+    """Everything but the effect is true here: the fitted model, its counts drawn behind a disc."""
+    capture, _, _, _, result = fitted
+    model, spots = result.model, torch.arange(capture.n_spots)
+    (disc,) = build_effects(["occlusion"], Scan.of(capture))
+    middle = model.centre().detach().mean(0)
+    true = {"x": 0.5 * float(middle[0]) + 0.03, "y": 0.5 * float(middle[1]), "z": 0.5 * float(middle[2])}
+    disc.set_all({**true, "radius": 0.3 * disc.scan.half, "opacity": 0.5})
+    counts = torch.poisson(
+        model.expected(spots, Extension([disc])), generator=torch.Generator().manual_seed(0)
+    )
+    found = Extension(build_effects(["occlusion"], disc.scan))
+    choose_shapes(model, found, spots, counts)
+    (seen,) = found.effects
+    for name in ("x", "y"):
+        assert seen.value(name).item() == pytest.approx(true[name], abs=0.1 * disc.scan.half)
+    assert seen.value("z").item() == pytest.approx(true["z"], rel=0.5)
+    assert seen.value("opacity").item() == pytest.approx(0.5, abs=0.2)
 
 
 def test_progress_counts_every_step(fitted):
