@@ -106,7 +106,7 @@ class Round:
     Args:
         steps: batches.
         left: rounds that follow by plan; the last one cools down.
-        settling: it comes from seeds, and the response waits for their places.
+        settling: it comes from seeds; the response and the shapes of effects wait for their places.
         contest: surfels and response stand still; those that come out faint are left out afterwards.
         parts: into which each side of a surfel is divided before it, if ``most`` surfels allow it.
         grow: surfels die and grow before it, one by one.
@@ -466,12 +466,21 @@ class SurfelFit:
             {"params": settled, "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
             {"params": response, "lr": response_rate},
-            {"params": list(self.extension.parameters()), "lr": s.effect_rate},
+            {"params": self._effect_parameters(), "lr": s.effect_rate},
         ]
         kept = [group | {"highest": group["lr"]} for group in groups if group["params"]]
         optimizer = torch.optim.Adam(kept, betas=(0.9, 0.98))
         self._set_rates(optimizer)
         return optimizer
+
+    def _effect_parameters(self) -> list[torch.nn.Parameter]:
+        """Those that a round fits: where a disc is, or how late an echo, waits for the places of the scene."""
+        still = self.plan[0].settling
+        return [
+            getattr(effect, f"raw_{p.name}")
+            for effect in self.extension.effects
+            for p in (effect.amplitudes if still else effect.declared.values())
+        ]
 
     def _set_rates(self, optimizer: torch.optim.Optimizer) -> None:
         now, step = self.plan[0], len(self.losses)

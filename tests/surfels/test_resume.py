@@ -132,6 +132,23 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 
 
+def test_shapes_of_effects_wait_for_the_places():
+    """A disc or a decay that is fitted while the scene is still wrong wanders off."""
+    fit = begun()
+    fit.schedule([Round(4, left=1, settling=True), Round(4)])
+    tail = fit.extension.effects[0]
+    tail.set("decay", 0.17)
+    seen = []
+    while not fit.finished:
+        fit.begin_round()
+        before = tail.raw_decay.item(), tail.raw_fraction.item()
+        while not fit.round_done:
+            fit.step()
+        seen.append((tail.raw_decay.item() != before[0], tail.raw_fraction.item() != before[1]))
+        fit.end_round()
+    assert seen == [(False, True), (True, True)]
+
+
 def test_a_plan_is_the_rounds_in_order():
     settings = dataclasses.replace(SETTINGS, rounds=2, outlines=2, steps=10, contest=7)
     contest = Round(7, left=4, settling=True, contest=True)
