@@ -474,7 +474,7 @@ class SurfelFit:
         return optimizer
 
     def _effect_parameters(self) -> list[torch.nn.Parameter]:
-        """Those that a round fits: where a disc is, or how late an echo, waits for the places of the scene."""
+        """Those that a round fits: where a disc is, or how late an echo, waits for the scene to settle."""
         still = self.plan[0].settling
         return [
             getattr(effect, f"raw_{p.name}")
