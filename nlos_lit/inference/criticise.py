@@ -217,6 +217,22 @@ class Loop:
         text = "asking single spots" if of_spots else "asking the pool"
         return self.steps("screen", f"{text}, {self.number}", f"pool{self.number}", asking)
 
+    def next(self, pool: Pool, free: bool) -> list[Member]:
+        """Who comes into the parsimonious scene.
+
+        Args:
+            pool: what the counts ask for beside it.
+            free: free terms, else effects.
+
+        Returns:
+            An effect with a number for each spot by itself, where the counts ask for nothing more than for
+            it: other terms would be taken for what it does. Else those that are asked for together.
+        """
+        lead = [c for c in pool.candidates[:1] if c.effect.per_spot and c.evidence > self.least]
+        if lead and not free and not lead[0].free:
+            return [Member(lead[0])]
+        return [Member(t.candidate, t.rivals) for t in pool.together if t.candidate.free == free]
+
     def joined(self, fit: SurfelFit, new: list[Candidate]) -> SurfelFit:
         """A parsimonious scene with more terms.
 
@@ -616,7 +632,7 @@ def criticise(
     pool = asked(effects=True)
     for free in (False, True):
         new = list[Member]()
-        while come := [Member(t.candidate, t.rivals) for t in pool.together if t.candidate.free == free]:
+        while come := loop.next(pool, free):
             coarse = loop.joined(coarse, [m.candidate for m in come])
             new, found.members = new + come, found.members + come
             told(first, coarse, found.members)

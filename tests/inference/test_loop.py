@@ -474,6 +474,16 @@ def test_what_single_spots_explain_is_asked_last(monkeypatch):
     assert found.final.names == {"wall_reflectance", "irf_tail"}
 
 
+def test_single_spots_that_lead_come_first(monkeypatch):
+    """By themselves; what is asked for beside them comes after."""
+    table = {"hot_spots": nats(50.0), "irf_tail": nats(20.0), "fine+hot_spots+irf_tail": nats(70.0)}
+    pool = [candidate("hot_spots"), candidate("irf_tail")]
+    world = World(monkeypatch, table, pool, beside={"irf_tail": {"hot_spots"}})
+    found = world.criticise()
+    assert names_of(found.accepted) == ["hot_spots", "irf_tail"]
+    assert world.rebuilt[0] == ({"hot_spots"}, 4)
+
+
 @pytest.mark.parametrize(("batches", "moved"), [(-50.0, False), (5.0, True)])
 def test_single_spots_need_no_scene_that_moves(monkeypatch, batches, moved):
     """Batches may make a fine scene worse by more than single spots gain, which are solved for."""
