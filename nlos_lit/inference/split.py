@@ -8,6 +8,7 @@ import numpy as np
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
+from nlos_lit.capture.wall_blocks import wall_blocks
 
 ROLES = ("fit", "fit", "select", "fit", "fit", "test", "fit", "select")
 STRIDE = 3  # coprime to the number of roles: every row and column of blocks has all roles
@@ -46,11 +47,8 @@ def split_spots(capture: Capture, blocks: int = 8) -> Split:
     Raises:
         UserError: a role is left without spots.
     """
-    points = [p for p in (capture.laser, capture.sensor) if np.ptp(p, axis=0).max() > 0]
-    xy = points[-1][:, :2] if points else capture.laser[:, :2]
-    low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
-    place = np.minimum((xy - low) / extent * blocks, blocks - 1e-6).astype(int)
-    role = np.array(ROLES)[(place[:, 0] + STRIDE * place[:, 1]) % len(ROLES)]
+    row, column = wall_blocks(capture, blocks)
+    role = np.array(ROLES)[(row + STRIDE * column) % len(ROLES)]
     first, last = capture.gate
     measured = capture.counts[:, first:last].any(1)
     parts = {name: np.flatnonzero((role == name) & measured) for name in ("fit", "select", "test")}
@@ -60,4 +58,4 @@ def split_spots(capture: Capture, blocks: int = 8) -> Split:
                 f"only {len(spots)} measured spots are left to {name}; "
                 "a diagnosis needs a scan of at least 16 × 16 spots"
             )
-    return Split(**parts, block=place[:, 0] * blocks + place[:, 1])
+    return Split(**parts, block=row * blocks + column)

@@ -20,12 +20,12 @@ from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import Sheet
 from nlos_lit.metrics.transients import Scores, transient_scores
 from nlos_lit.surfels.effect_start import choose_shapes
-from nlos_lit.surfels.growth import Seeds, prune_and_grow
+from nlos_lit.surfels.growth import PlaceTest, Seeds, begin_bodies, prune_and_grow
 from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
 from nlos_lit.surfels.outlines import MEND, SEARCH, cut_back, extend, solve_albedos
 
 Progress = Callable[[int, int], None]
-PLAIN = ("order", "place", "tested", "done", "more", "before", "undo", "finer", "history", "losses")
+PLAIN = ("order", "place", "tested", "done", "more", "bodies", "before", "undo", "finer", "history", "losses")
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
@@ -175,12 +175,12 @@ class SurfelFit:
         counts: ``[N, T_gate]`` of the training spots ``train`` ``[N]``; bins that the capture does not
             hold as observed take part in nothing.
         settings: of the fit.
-        reserve: places that may grow a surfel, besides those next to surfels.
+        reserve: places where a body may be that is missing.
         extension: effects that are fitted along, in place.
         generator: draws the batches.
         order: ``[N]`` permutation of the training rows, the first of which are used to test surfels.
-        judged: ``[J]`` rows of the capture that are not trained; by them it is judged how fine the surfels
-            are to be. Without any no rounds follow those of the plan.
+        judged: ``[J]`` rows of the capture that are not trained; by them it is judged whether bodies are
+            missing, and how fine the surfels are to be. Without any no rounds follow those of the plan.
 
     Attributes:
         done: batches so far.
@@ -211,7 +211,8 @@ class SurfelFit:
         seen = capture.gated_observed()
         self.observed = None if seen is None else torch.from_numpy(seen)[train.cpu()].to(counts.device)
         self.plan: list[Round] = []
-        self.more, self.before = 0, torch.zeros(0)  # rounds that may follow; nats before the latest of them
+        self.more, self.bodies = 0, 0  # rounds that may follow, and those before which bodies are begun
+        self.before = torch.zeros(0)  # nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
         self.finer = True  # surfels may be divided before one of them
         self.history: list[dict[str, float]] = []
@@ -340,24 +341,27 @@ class SurfelFit:
         )
         sensor.set_intensity(value)
 
-    def schedule(self, plan: Sequence[Round], more: int = 0) -> None:
+    def schedule(self, plan: Sequence[Round], more: int = 0, bodies: int = 0) -> None:
         """Say what is to be done next; it takes the place of what was.
 
-        Last rounds of outlines are added while the fit is above the noise: bright captures take longer to
-        converge, and show finer detail. Each must predict the judged spots better by more than the standard
-        error of it, or is undone. Surfels are divided in four before it while they may be. Where that was
-        undone they stay as they are, and where a round without it was, none follows.
+        Last rounds of outlines are added while the fit is above the noise. Each must predict the judged spots
+        better by more than the standard error of it, or is undone. Before the first of them bodies are begun
+        that are missing (:func:`~nlos_lit.surfels.growth.begin_bodies`), as long as there are any and it
+        helps. Before the others, since bright captures take longer to converge and show finer detail, surfels
+        are divided in four while they may be. Where that was undone they stay as they are, and where a round
+        without it was, none follows.
 
         Args:
             plan: the rounds.
-            more: last rounds that may be added, at most.
+            more: last rounds that may be added, at most …
+            bodies: … and before them those that look for missing bodies.
         """
-        self.plan, self.more = list(plan), more
+        self.plan, self.more, self.bodies = list(plan), more, bodies
         self.undo, self.finer = None, self.settings.subdivide is None
         self._add_round()
 
     def _add_round(self) -> None:
-        if self.plan or not len(self.judged) or not (self.more or self.undo):
+        if self.plan or not len(self.judged) or not (self.more or self.bodies or self.undo):
             return
         nats, above_noise = self._predicted()
         tried, self.undo = self.undo, None
@@ -365,15 +369,40 @@ class SurfelFit:
             nats, above_noise, cells = self.before, True, self.model.lateral.shape
             self._take_back(tried)
             divided = self.model.lateral.shape != cells
-            self.finer, self.more = False, self.more if divided else 0
-        if not self.more or not above_noise:
+            if self.bodies:
+                self.bodies = 0
+            else:
+                self.finer, self.more = False, self.more if divided else 0
+        elif tried is not None:
+            self.bodies = max(0, self.bodies - 1)
+        if not above_noise:
             return
-        s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
-        divide = self.finer and wide and 4 * len(self.model) <= s.most
-        self.plan = [Round(2 * s.steps, parts=2 if divide else 1, outline=True)]
-        self.more, self.before = self.more - 1, nats
         model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
-        self.undo = copy.deepcopy({"model": model, "extension": extension})
+        undo = copy.deepcopy({"model": model, "extension": extension})
+        parts = 1
+        if self.bodies and not self._begin_bodies():
+            self.bodies = 0
+        if not self.bodies:
+            if not self.more:
+                return
+            self.more -= 1
+            s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
+            divide = self.finer and wide and 4 * len(self.model) <= s.most
+            parts = 2 if divide else 1
+        self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
+        self.before, self.undo = nats, undo
+
+    def _begin_bodies(self) -> int:
+        self.model.link()
+        return begin_bodies(self.model, self.grid, self._place_test(), self.reserve)
+
+    def _place_test(self) -> PlaceTest:
+        """Of places, by the tested spots; bins that were not recorded ask for nothing."""
+        spots, counts = self.train[self.tested], self.counts[self.tested]
+        expected = self.model.expected(spots, self.extension).clamp_min(1e-9)
+        if self.observed is not None:
+            counts = torch.where(self.observed[self.tested], counts, expected)
+        return PlaceTest(self.model, self.capture, spots, counts, expected, self.extension)
 
     def _take_back(self, undo: dict[str, Any]) -> None:
         """Surfels, response and effects as they were before a round."""
@@ -419,8 +448,8 @@ class SurfelFit:
         if now.shapes:
             choose_shapes(self.model, self.extension, spots, counts)
         if now.grow:
-            parts = (self.capture, self.grid, self.reserve, self.counts, self.train, self.tested)
-            prune_and_grow(self.model, *parts, s.surfel_cost, self.extension, self.observed)
+            share = len(self.tested) / len(self.train)
+            prune_and_grow(self.model, self.grid, self._place_test(), share, s.surfel_cost)
         if now.parts > 1 and (now.settling or now.parts**2 * len(self.model) <= s.most):
             self.model.divide(now.parts)
         widest = float(self.model.cell.max())

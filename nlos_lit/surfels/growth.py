@@ -9,6 +9,7 @@ whatever the ambient light.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.background import quietest_level
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.capture.wall_blocks import wall_blocks
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.irf import convolve_time, response
 from nlos_lit.functional.surfel_graph import BEND, misfits
@@ -35,6 +37,7 @@ from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 CHUNK = 1 << 21  # paths at a time
+BLOCKS = 6  # along each side of the wall, between which scores are held against each other
 EXACT = "donot_use_mm_for_euclid_dist"  # distances as differences: products cancel for near points
 
 
@@ -49,10 +52,15 @@ class Seeds(NamedTuple):
 
 
 class Score(NamedTuple):
-    """Per candidate: score by albedo, its information; both summed over the tested spots."""
+    """Per candidate: score by albedo, its information, summed over the tested spots; and how both agree.
+
+    ``scatter`` is how much more the scores of wall blocks scatter about one albedo than counts do, at least
+    1: a body is as bright for one part of the wall as for another.
+    """
 
     score: Tensor  # [V]
     information: Tensor  # [V]
+    scatter: Tensor  # [V]
 
     @property
     def significance(self) -> Tensor:
@@ -184,7 +192,7 @@ def score(
         visible: ``[B, V]`` share of each place's light that the spots see; None: all.
 
     Returns:
-        score and information of each place's albedo.
+        score and information of each place's albedo, and how wall blocks agree.
     """
     sensor, bins = laser_sensor, capture.gate[1]
     device = counts.device
@@ -212,7 +220,9 @@ def score(
     offsets = quadrature(points, device)
     extent = torch.tensor(cell, device=device).abs()
     n = len(candidates.centre)
-    total = torch.zeros(2, n, dtype=torch.float64, device=device)
+    row, column = wall_blocks(capture, BLOCKS)
+    block = torch.from_numpy((row * BLOCKS + column)[rows]).to(device)
+    total = torch.zeros(2, BLOCKS**2, n, dtype=torch.float64, device=device)
     size = max(1, CHUNK // (len(spots) * len(offsets)))
     for start in range(0, n, size):
         part = candidates.take(torch.arange(start, min(n, start + size), device=device))
@@ -222,13 +232,23 @@ def score(
         energy = paths.contribution
         if visible is not None:
             energy = energy * visible[:, start : start + len(part.centre), None]
-        g = (energy * spline_at(pull, time)[0].view(shape)).sum((0, 2))
+        g = (energy * spline_at(pull, time)[0].view(shape)).sum(2)
         # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information
         # otherwise.
-        f = (energy.sum(2) * (energy * spline_at(weight, time)[0].view(shape)).sum(2)).sum(0)
-        total[0, start : start + len(g)], total[1, start : start + len(g)] = g.double(), f.double()
+        f = energy.sum(2) * (energy * spline_at(weight, time)[0].view(shape)).sum(2)
+        here = slice(start, start + g.shape[1])
+        total[0, :, here].index_add_(0, block, g.double())
+        total[1, :, here].index_add_(0, block, f.double())
     gain = sensor.intensity().item()
-    return Score(total[0] * gain, total[1] * gain**2)
+    return _over_blocks(total[0] * gain, total[1] * gain**2, len(block.unique()))
+
+
+def _over_blocks(score: Tensor, information: Tensor, number: int) -> Score:
+    """Sums over wall blocks of scores and information ``[blocks, V]``, ``number`` of which hold spots."""
+    both = Score(score.sum(0), information.sum(0), torch.ones(score.shape[1]))
+    albedo = (both.score / both.information.clamp_min(1e-30)).clamp_min(0)
+    away = (score - albedo * information).square() / information.clamp_min(1e-30)
+    return both._replace(scatter=(away.sum(0) / max(1, number - 1)).clamp_min(1.0))
 
 
 def continuations(centre: Tensor, normal: Tensor, cell: Tensor) -> tuple[Seeds, Tensor]:
@@ -339,7 +359,7 @@ APART = 0.7  # surfels keep this many cells from each other
 FIRST_SHARE = 0.5  # of the best albedo: neighbours that grow together share the same residual
 ALIKE = 0.7  # deviation of ln(albedo) that a continued sheet is given
 ALBEDOS = (0.2, 0.3, 0.4, 0.5, 0.65, 0.8, 1.0, 1.25, 1.6, 2.0)  # of its neighbour's, that are tried
-LONE = 12.0  # nats, 5 standard deviations, that a surfel without a sheet must gain
+LONE = 12.0  # nats, 5 standard deviations, that a body which is missing must gain
 
 
 @torch.no_grad()
@@ -405,58 +425,70 @@ def continuing_gain(result: Score, albedo: Tensor, dispersion: float) -> tuple[T
     return best, tried.gather(1, which[:, None])[:, 0]
 
 
+@dataclass(frozen=True)
+class PlaceTest:
+    """What the counts ask of places beside the present surface.
+
+    Args:
+        model: the surfels, whose expectation the counts are held against.
+        capture: that is fitted.
+        spots: ``[B]`` rows of the capture that are looked at.
+        counts: ``[B, T_gate]`` of the spots.
+        expected: ``[B, T_gate]`` of the spots by the model.
+        hooks: effects of the present expectation; places are tested with their response.
+    """
+
+    model: SurfelModel
+    capture: Capture
+    spots: Tensor
+    counts: Tensor
+    expected: Tensor
+    hooks: Hooks = NOTHING
+
+    def surfels(self) -> Score:
+        """Of the surfels themselves, with the light that they are seen by."""
+        model = self.model
+        visible = model.arriving(model.visible[self.spots]) if len(model.visible) else None
+        return self._score(Seeds(*model.placed()), model.quadrature, visible)
+
+    def places(self, places: Seeds) -> Score:
+        """Of places without a surfel, each seen past the surfels; their centres stand for them."""
+        model = self.model
+        hidden = len(model.visible) > 0
+        return self._score(
+            places, 1, model.arriving(model.sees(self.spots, places.centre)) if hidden else None
+        )
+
+    def _score(self, places: Seeds, points: int, visible: Tensor | None) -> Score:
+        cell, sensor = (float(self.model.cell[0]), float(self.model.cell[1])), self.model.laser_sensor
+        given = (places, self.capture, cell, points, sensor, self.counts, self.expected)
+        return score(*given, self.spots, self.hooks, visible)
+
+
 @torch.no_grad()
-def prune_and_grow(
-    model: SurfelModel,
-    capture: Capture,
-    grid: VolumeGrid,
-    reserve: Seeds,
-    counts: Tensor,
-    train: Tensor,
-    tested: Tensor,
-    cost: float,
-    hooks: Hooks = NOTHING,
-    observed: Tensor | None = None,
-) -> None:
-    """Drop surfels that neither counts nor neighbours speak for; extend sheets; begin new ones.
+def prune_and_grow(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, share: float, cost: float) -> None:
+    """Drop surfels that neither counts nor neighbours speak for, and extend sheets.
 
     A surfel stays while what the counts lose without it (``a² F/2``) and without its neighbours in one
     plane (:func:`support`) exceeds ``cost``. A place that continues a sheet gets one where it gains more than
-    that. A place of the reserve, away from all sheets, must gain ``LONE`` nats, counted against the
-    spread of all places' scores: a misfit that is not the surface's makes light seem to be missing
-    everywhere.
+    that.
 
     Args:
         model: whose surfels are replaced; linked, its normals its own.
-        capture: that is fitted.
         grid: whose depths bound the volume.
-        reserve: unused seeds.
-        counts: ``[N, T_gate]`` of the training spots.
-        train: ``[N]`` their rows of the capture.
-        tested: rows of ``counts`` that are looked at.
-        cost: nats that a lone surfel must be worth.
-        hooks: effects of the present expectation; candidates are tested with their response.
-        observed: ``[N, T_gate]`` bool, the bins that were recorded; None: all.
+        test: of places beside it.
+        share: of the training spots that the test looks at; the others are taken to say the same.
+        cost: nats that a surfel must be worth.
 
     Raises:
         UserError: no surfel is left.
     """
-    spots, seen = train[tested], counts[tested]
-    expected = model.expected(spots, hooks).clamp_min(1e-9)
-    if observed is not None:  # what was not recorded asks for nothing
-        seen = torch.where(observed[tested], seen, expected)
-    scale = len(train) / len(tested)
-    sensor, cell = model.laser_sensor, (float(model.cell[0]), float(model.cell[1]))
 
-    def test(places: Seeds, points: int, visible: Tensor | None = None) -> Score:
-        found = score(places, capture, cell, points, sensor, seen, expected, spots, hooks, visible)
-        return Score(found.score * scale, found.information * scale)
+    def all_spots(found: Score) -> Score:
+        return found._replace(score=found.score / share, information=found.information / share)
 
     present, albedo = Seeds(*model.placed()), model.albedo()
-    hidden = len(model.visible) > 0
-    seen_now = model.arriving(model.visible[spots]) if hidden else None
-    information = test(present, model.quadrature, seen_now)[1]
-    worth = albedo.double() ** 2 * information / 2
+    worth = albedo.double() ** 2 * all_spots(test.surfels()).information / 2
     kept = (worth + support(model, worth) > cost) & within_depths(present.centre, grid)
     if not kept.any():
         raise UserError(
@@ -464,35 +496,57 @@ def prune_and_grow(
             "maxima"
         )
     apart = APART * float(model.cell.max())
-
-    def shown(places: Seeds) -> Score:
-        return test(places, 1, model.arriving(model.sees(spots, places.centre)) if hidden else None)
-
     places, source = continuations(*present, model.cell)
     free = ~occupied(places.centre, present.centre, apart) & within_depths(places.centre, grid)
     free &= places.normal[:, 2] < 0.2
     places, source = places.take(free), source[free]
-    result = shown(places)
+    result = all_spots(test.places(places))
     gain, light = continuing_gain(result, albedo[source], dispersion(result.significance))
     wanted = gain > cost
     places, gain, light = places.take(wanted), gain[wanted], light[wanted]
+    _add(model, kept, places, gain, light, apart)
 
-    others = facings(
-        reserve.take(~occupied(reserve.centre, present.centre, apart) & within_depths(reserve.centre, grid))
-    )
-    result = shown(others)
-    lone = result.significance.clamp_min(0) ** 2 / 2 / dispersion(result.significance)
-    begun = lone > LONE
-    others = others.take(begun)
-    first = (result.score / result.information.clamp_min(1e-30))[begun].clamp_max(float(albedo.mean()))
-    places = Seeds(*(torch.cat(pair) for pair in zip(places, others, strict=True)))
-    gain, light = torch.cat([gain, lone[begun]]), torch.cat([light, first])
+
+@torch.no_grad()
+def begin_bodies(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, reserve: Seeds) -> int:
+    """Begin bodies that are missing, at places of the reserve away from all surfels.
+
+    A place must gain ``LONE`` nats on the spots that are looked at, divided by how much more the scores of
+    wall blocks scatter than counts do: a body is as bright for one part of the wall as for another, and what
+    the model lacks otherwise mostly is not.
+
+    Args:
+        model: which gets more surfels; linked, its normals its own.
+        grid: whose depths bound the volume.
+        test: of places beside it.
+        reserve: places where one may be, each of which is tried with several normals.
+
+    Returns:
+        how many surfels were begun.
+    """
+    apart = APART * float(model.cell.max())
+    near = occupied(reserve.centre, model.placed()[0], apart)
+    places = facings(reserve.take(~near & within_depths(reserve.centre, grid)))
+    if not len(places.centre):
+        return 0
+    result = test.places(places)
+    gain = result.significance.clamp_min(0) ** 2 / 2 / result.scatter
+    begun = gain > LONE
+    light = (result.score / result.information.clamp_min(1e-30)).clamp_max(float(model.albedo().mean()))
+    everything = torch.ones(len(model), dtype=torch.bool, device=gain.device)
+    return _add(model, everything, places.take(begun), gain[begun], light[begun], apart)
+
+
+def _add(model: SurfelModel, kept: Tensor, places: Seeds, gain: Tensor, light: Tensor, apart: float) -> int:
+    """Keep some surfels and begin others at the best of some places that are so far apart; how many."""
+    present, albedo = Seeds(*model.placed()).take(kept), model.albedo()[kept]
     # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to
     # explain it otherwise.
-    chosen = best_apart(places.centre, gain, apart)[: max(64, len(albedo) // 4)]
+    chosen = best_apart(places.centre, gain, apart)[: max(64, len(model) // 4)]
     new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
     model.place(
-        torch.cat([present.centre[kept], new.centre]),
-        torch.cat([present.normal[kept], new.normal]),
-        torch.cat([albedo[kept], begin]),
+        torch.cat([present.centre, new.centre]),
+        torch.cat([present.normal, new.normal]),
+        torch.cat([albedo, begin]),
     )
+    return len(chosen)

@@ -208,6 +208,43 @@ def test_surfels_that_are_narrow_enough_are_not_divided(monkeypatch, wide, parts
     assert [each.parts for each in fit.plan] == [parts]
 
 
+@pytest.mark.parametrize(
+    ("found", "gains", "seen"),
+    [
+        ([3, 2, 1], [1, 1, 1], [True, True, False]),  # as many as are asked for, then finer
+        ([3, 0, 1], [1, 1, 1], [True, False, False]),  # none is missing
+        ([3, 2, 1], [-1, 1, 1], [True, False, False]),  # it does not help
+    ],
+)
+def test_missing_bodies_come_first_while_there_are_any_and_they_help(monkeypatch, found, gains, seen):
+    fit, found = waiting({"subdivide": 1}), iter(found)
+    nats, began = torch.zeros(4), []
+
+    def begin(model, *_):
+        if number := next(found):
+            model.place(
+                torch.cat([model.centre(), torch.tensor([[0.0, 0.0, 0.9]]).expand(number, 3)]),
+                torch.cat([model.normal(), torch.tensor([[0.0, 0.0, -1.0]]).expand(number, 3)]),
+                torch.cat([model.albedo(), torch.ones(number)]),
+            )
+        return number
+
+    monkeypatch.setattr("nlos_lit.surfels.fit.begin_bodies", begin)
+    monkeypatch.setattr(fit, "_predicted", lambda: (nats.clone(), True))
+    before = len(fit.model)
+    fit.schedule([], 3, bodies=2)
+    for gain in gains:
+        began.append(bool((fit.model.centre()[:, 2] > 0.85).any()) and fit.bodies > 0)
+        fit.begin_round()
+        fit.step(), fit.step()
+        nats += gain
+        fit.end_round()
+        if gain < 0:
+            assert len(fit.model) == before
+            nats -= gain
+    assert began == seen
+
+
 @pytest.mark.parametrize("divided", [True, False])
 @pytest.mark.parametrize(("gain", "stays"), [(0.49, False), (0.51, True)])
 def test_a_round_that_predicts_nothing_better_is_undone(monkeypatch, divided, gain, stays):

@@ -34,7 +34,7 @@ def begun() -> SurfelFit:
     fit.settings, fit.tested = SETTINGS, fit.order[:50]
     fit.grid = VolumeGrid((-1.0, -1.0, 0.2), (0.1, 0.1, 0.1), (20, 20, 20))
     fit.reserve = Seeds(torch.tensor([[0.0, 0.0, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
-    fit.schedule(plan_from_seeds(SETTINGS, 2, scan_shapes=True), SETTINGS.more)
+    fit.schedule(plan_from_seeds(SETTINGS, 2, scan_shapes=True), SETTINGS.more, bodies=1)
     return fit
 
 

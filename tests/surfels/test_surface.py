@@ -27,8 +27,10 @@ from nlos_lit.surfels.effect_start import asked_of, choose_shapes
 from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels
 from nlos_lit.surfels.growth import (
+    PlaceTest,
     Score,
     Seeds,
+    begin_bodies,
     best_apart,
     continuations,
     continuing_gain,
@@ -38,6 +40,7 @@ from nlos_lit.surfels.growth import (
     support,
 )
 from nlos_lit.surfels.model import OPAQUE, SurfelModel
+from nlos_lit.surfels.start import BODIES
 
 QUICK = SurfelSettings(contest=40, rounds=2, outlines=1, more=0, test_spots=200, floor=0.15, per_cell=2)
 BIN = 0.0096
@@ -147,11 +150,13 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
         result = fit_surfels(capture, intensity, grid, settings, train, progress=progress)
         deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
         results.append(result)
-    assert [len(result.history) for result in results] == [1, 2, 4]
+    after = [len(result.history) - 1 for result in results]
+    assert after[0] == 0 < after[1] < after[2]
+    assert all(n <= more + BODIES for n, more in zip(after, (0, 1, 3), strict=True))
     assert deviances[0] > deviances[1] > deviances[2]
-    of = dict(seen)
-    assert [k for k, _ in seen] == list(range(1, 81))
-    assert [of[k] for k in (40, 41, 80)] == [40, 80, 80]
+    of, batches = dict(seen), 40 * len(results[1].history)
+    assert [k for k, _ in seen] == list(range(1, batches + 1))
+    assert [of[k] for k in (40, 41, batches)] == [40, 80, batches]
     given = results[-1].fit
     judged, train_of_it = set(given.judged.tolist()), set(given.train.tolist())
     assert len(judged) == len(train) // 10
@@ -328,11 +333,55 @@ def test_surfels_in_empty_space_die_and_missing_ones_grow(fitted):
     )
     train = torch.from_numpy(np.flatnonzero(~held))
     counts = torch.from_numpy(capture.gated_counts())[train]
-    nothing = Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
-    prune_and_grow(model, capture, grid, nothing, counts, train, torch.arange(200), cost=3.0)
+    test = PlaceTest(model, capture, train, counts, model.expected(train))
+    prune_and_grow(model, grid, test, share=1.0, cost=3.0)
     now = model.centre().detach()
     assert torch.cdist(ghosts, now).min() > 0.02
     assert ((now[:, :2] - torch.tensor([0.12, 0.08])).norm(dim=1) < 0.06).sum() >= 2
+
+
+def without_the_back(fitted) -> tuple[SurfelModel, torch.Tensor, torch.Tensor]:
+    """The fitted scene with its front plate alone, the fitted spots and what was counted there."""
+    capture, held, _, _, result = fitted
+    model = SurfelModel.from_state(capture, result.model.state_dict())
+    model.keep(model.centre()[:, 2] < 0.62)
+    train = torch.from_numpy(np.flatnonzero(~held))
+    return model, train, torch.from_numpy(capture.gated_counts())[train]
+
+
+def test_a_body_that_is_missing_is_found(fitted):
+    capture, _, _, grid, result = fitted
+    model, train, counts = without_the_back(fitted)
+    front, reserve = model.centre().clone(), result.fit.reserve
+    test = PlaceTest(model, capture, train, counts, model.expected(train))
+    number = begin_bodies(model, grid, test, reserve)
+    begun = model.centre().detach()[len(front) :]
+    assert torch.equal(model.centre()[: len(front)], front)
+    assert len(begun) == number >= 4
+    away = begun - torch.tensor([-0.15, -0.12, 0.75])
+    reach = torch.tensor([0.175, 0.15, 0.0]) + 2 * float(model.cell.max())
+    assert float((away.abs() < reach).all(1).float().mean()) > 0.8
+    nothing = PlaceTest(model, capture, train, counts, counts.clamp_min(0.1))
+    assert begin_bodies(model, grid, nothing, reserve) == 0
+
+
+@pytest.mark.parametrize(("lit", "found"), [("everywhere", True), ("in a corner", False)])
+def test_light_that_is_missing_in_a_corner_alone_is_no_body(fitted, lit, found):
+    """The same light twice, sixty times as bright where a ninth of the wall sees it alone."""
+    capture, grid = fitted[0], fitted[3]
+    model, train, _ = without_the_back(fitted)
+    expected = model.expected(train)
+    body = SurfelModel.from_state(capture, model.state_dict())
+    here = Seeds(torch.tensor([[-0.15, -0.12, 0.75]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    body.place(*here, torch.ones(1))
+    light = body.light(train)
+    corner = torch.from_numpy((capture.laser[train.numpy(), :2] > 1 / 6).all(1))
+    share = torch.ones(len(train)) if lit == "everywhere" else 60.0 * corner
+    # Ten standard deviations of what this light can be seen by.
+    light = 10 * light * share[:, None] / (light.square() / expected).sum().sqrt()
+    test = PlaceTest(model, capture, train, expected + light, expected)
+    assert float(test.places(here).significance) > 5
+    assert (begin_bodies(model, grid, test, here) == 1) == found
 
 
 def test_candidates_keep_apart():
@@ -362,7 +411,7 @@ def test_a_bent_continuation_lies_on_the_circle_through_both_places():
 
 def test_gains_of_a_continued_sheet_by_hand():
     """Score 40, information 100: the best albedo is 0.4, and gains 40·0.4 - 50·0.16 = 8 nats."""
-    result = Score(torch.tensor([40.0]), torch.tensor([100.0]))
+    result = Score(torch.tensor([40.0]), torch.tensor([100.0]), torch.ones(1))
     gain, albedo = continuing_gain(result, torch.tensor([0.4]), 1.0)
     assert (gain.item(), albedo.item()) == (pytest.approx(8.0), pytest.approx(0.4))
     # A neighbour twice as bright: 0.4 is half of it, which the prior (deviation 0.7) holds against it.
@@ -444,13 +493,13 @@ def outside(result: FittedSurfels) -> float:
 
 
 def test_outlines_are_where_the_plates_end(fitted):
-    """All together, and finer where that predicts more, against as many rounds one by one."""
+    """All together, against as many rounds one by one."""
     capture, held, intensity, grid, result = fitted
     train, scored = np.flatnonzero(~held), np.flatnonzero(held)
     together, one_by_one = (
         fit_surfels(capture, intensity, grid, settings, train, seed=0, heldout_spots=scored)
         for settings in (
-            dataclasses.replace(QUICK, rounds=2, outlines=2, more=2),
+            dataclasses.replace(QUICK, rounds=2, outlines=4),
             dataclasses.replace(QUICK, rounds=6, outlines=0),
         )
     )
