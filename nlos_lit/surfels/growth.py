@@ -532,6 +532,8 @@ def begin_bodies(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, reserve:
     result = test.places(places)
     gain = result.significance.clamp_min(0) ** 2 / 2 / result.scatter
     begun = gain > LONE
+    if not begun.any():
+        return 0
     light = (result.score / result.information.clamp_min(1e-30)).clamp_max(float(model.albedo().mean()))
     everything = torch.ones(len(model), dtype=torch.bool, device=gain.device)
     return _add(model, everything, places.take(begun), gain[begun], light[begun], apart)

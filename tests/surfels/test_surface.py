@@ -361,8 +361,11 @@ def test_a_body_that_is_missing_is_found(fitted):
     away = begun - torch.tensor([-0.15, -0.12, 0.75])
     reach = torch.tensor([0.175, 0.15, 0.0]) + 2 * float(model.cell.max())
     assert float((away.abs() < reach).all(1).float().mean()) > 0.8
+    model.update_visibility()
+    before = model.visible.clone()
     nothing = PlaceTest(model, capture, train, counts, counts.clamp_min(0.1))
     assert begin_bodies(model, grid, nothing, reserve) == 0
+    assert torch.equal(model.visible, before), "it stays as it was"
 
 
 @pytest.mark.parametrize(("lit", "found"), [("everywhere", True), ("in a corner", False)])
