@@ -22,7 +22,7 @@ BYTES_PER_PATH = 160  # peak of forward and backward pass, measured
 BYTES_KEPT = 24  # of a path while albedos are solved for: six numbers
 WIDEST = 4.0  # bins of path that a surfel's side spans at most
 ASIDE = 10  # one of so many training spots judges how fine surfels are to be
-RESERVE = 0.02  # of the image: maxima down to this share of its largest may be bodies that are missing
+RESERVE = 0.02  # maxima down to this share of the floor may be bodies that are missing
 BODIES = 3  # rounds that may follow, before which such are begun
 
 
@@ -82,7 +82,7 @@ def seed_surfels(
     generator = torch.Generator().manual_seed(seed)
     order = torch.randperm(len(train), generator=generator)
     tested = order[: s.test_spots]
-    candidates, value = volume_maxima(intensity, grid, min(RESERVE, s.floor), s.per_cell, lateral)
+    candidates, value = volume_maxima(intensity, grid, RESERVE * s.floor, s.per_cell, lateral)
     null = rank_one(counts)[tested]
     scores = score(candidates, capture, lateral.pitch, 1, sensor, counts[tested], null, train[tested])
     significance = scores.significance * math.sqrt(len(train) / len(tested))
