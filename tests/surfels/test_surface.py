@@ -40,6 +40,7 @@ from nlos_lit.surfels.growth import (
     support,
 )
 from nlos_lit.surfels.model import OPAQUE, SurfelModel
+from nlos_lit.surfels.outlines import SEARCH, solve_albedos
 from nlos_lit.surfels.start import BODIES
 
 QUICK = SurfelSettings(contest=40, rounds=2, outlines=1, more=0, test_spots=200, floor=0.15, per_cell=2)
@@ -355,12 +356,13 @@ def test_a_body_that_is_missing_is_found(fitted):
     front, reserve = model.centre().clone(), result.fit.reserve
     test = PlaceTest(model, capture, train, counts, model.expected(train))
     number = begin_bodies(model, grid, test, reserve)
-    begun = model.centre().detach()[len(front) :]
     assert torch.equal(model.centre()[: len(front)], front)
-    assert len(begun) == number >= 4
-    away = begun - torch.tensor([-0.15, -0.12, 0.75])
-    reach = torch.tensor([0.175, 0.15, 0.0]) + 2 * float(model.cell.max())
-    assert float((away.abs() < reach).all(1).float().mean()) > 0.8
+    assert len(model) == len(front) + number
+    solve_albedos(model, train, counts, 0.7, 1.0, SEARCH)
+    away = model.centre().detach()[len(front) :] - torch.tensor([-0.15, -0.12, 0.75])
+    reach = torch.tensor([0.175, 0.15, 0.0]) + float(model.cell.max())
+    inside, albedo = (away.abs() < reach).all(1), model.albedo().detach()[len(front) :]
+    assert float(albedo[inside].sum() / albedo.sum()) > 0.8
     model.update_visibility()
     before = model.visible.clone()
     nothing = PlaceTest(model, capture, train, counts, counts.clamp_min(0.1))
