@@ -232,9 +232,9 @@ def together(
 
     for free in (False, True) if effects else (True,):
         asked = [] if taken else [c for c in loud if c.free == free]
-        for c in asked:
-            raw[c.name] = weighted_columns(problem, c.effect)
-            freed[c.name] = projector.free(raw[c.name])
+        columns = {c.name: weighted_columns(problem, c.effect) for c in asked}
+        raw |= columns
+        freed |= _freed(projector, columns)
         while len(taken) < room:
             best = max((c.evidence for c in asked), default=0.0)
             near = [c for c in asked if c.evidence > max(least, MOST * best)]
@@ -289,7 +289,7 @@ def own_evidence(
     effects = {e.name: e for e in fit.extension.effects}
     laws = {n: e for n, e in effects.items() if not e.per_spot}
     columns = {n: weighted_columns(problem, e, shapes=True) for n, e in laws.items()}
-    freed = {n: whole.free(z) for n, z in columns.items()}
+    freed = _freed(whole, columns)
     above = {n: _above_null(e) for n, e in effects.items()}
     does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
@@ -426,22 +426,34 @@ def _parted(projector: Projector, terms: Iterable[tuple[Of, Tensor]]) -> Iterato
 
     A projection passes over all nuisance columns, however few it projects.
     """
-    group: list[tuple[Of, Tensor]] = []
-
-    def projected() -> Iterator[tuple[Of, Tensor, Freed]]:
+    for group in _grouped(terms):
         freed, start = projector.freed(torch.cat([columns for _, columns in group], 1)), 0
         for of, columns in group:
             part = slice(start, start + columns.shape[1])
             yield of, columns, Freed(*(each[:, part] for each in freed))
             start = part.stop
 
+
+def _freed(projector: Projector, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Columns of several terms, by name, after the projector's first step; as many at once."""
+    found = dict[str, Tensor]()
+    for group in _grouped(terms.items()):
+        freed = projector.free(torch.cat([columns for _, columns in group], 1))
+        parts = freed.split([columns.shape[1] for _, columns in group], 1)
+        found |= {name: part for (name, _), part in zip(group, parts, strict=True)}
+    return found
+
+
+def _grouped(terms: Iterable[tuple[Of, Tensor]]) -> Iterator[list[tuple[Of, Tensor]]]:
+    """Terms with their columns, about ``TOGETHER`` columns at a time."""
+    group: list[tuple[Of, Tensor]] = []
     for term in terms:
         group.append(term)
         if sum(columns.shape[1] for _, columns in group) >= TOGETHER:
-            yield from projected()
+            yield group
             group = []
     if group:
-        yield from projected()
+        yield group
 
 
 def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[tuple[Shape, Tensor]]:
