@@ -199,9 +199,11 @@ def together(
     """Terms that are asked for beside each other: each beside all that were taken before it.
 
     Strong faults hide one another, and the same trace may be that of several terms. So the one that is asked
-    for most is taken, its columns go to what the base can do by itself, and all others are asked again. Of
-    those that have most of the largest evidence the simplest is taken. Free terms are taken only where no
-    effect is: a scene that was fitted with one has less need of the effect that it stands for.
+    for most is taken, its columns go to what the base can do by itself, and all others are asked again. Who
+    loses more than half of its evidence by that is a look-alike, and waits: what is left of it may be what
+    one linear step of the first gets wrong. Of those that have most of the largest evidence the simplest is
+    taken. Free terms are taken only where no effect is: a scene that was fitted with one has less need of the
+    effect that it stands for.
 
     Args:
         problem: of the tested spots.
@@ -249,7 +251,8 @@ def together(
                 c for c, now in zip(before, asked, strict=True) if c.evidence > max(least, 2 * now.evidence)
             ]
             taken.append(Taken(first, sorted(lost, key=lambda c: -c.evidence)))
-            asked = [c for c in asked if c.loud > least]
+            rivals = {c.name for c in lost}
+            asked = [c for c in asked if c.loud > least and c.name not in rivals]
     return taken
 
 

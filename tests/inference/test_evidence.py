@@ -536,6 +536,15 @@ def test_terms_are_asked_for_beside_those_that_were_taken(alike):
         assert taken(strengths, alike, 9, 0.5, effects) == [("free_rate", [])]
 
 
+def test_a_look_alike_waits_until_the_first_is_in_the_model(alike, monkeypatch):
+    """Both are asked for, also beside each other; what is left of the second may be an error of the first."""
+    monkeypatch.setitem(ALIKE, "time_offset", ([0.9, 0.1, 0.0], 0))
+    monkeypatch.delitem(ALIKE, "afterpulsing")
+    for second in (0.0, -1.0):
+        found = taken([2.0, second, 1.0], alike, 9)
+        assert found == [("irf_tail", ["time_offset"]), ("pile_up", [])]
+
+
 def test_a_term_with_a_prior_keeps_its_scale(known):
     effect = effect_of("power_drift", SCAN)
     truth = columns(effect) @ TRUTH + normal(ROWS, seed=5)
