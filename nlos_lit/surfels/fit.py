@@ -450,6 +450,7 @@ class SurfelFit:
         if now.grow:
             share = len(self.tested) / len(self.train)
             prune_and_grow(self.model, self.grid, self._place_test(), share, s.surfel_cost)
+            self._begin_bodies()
         if now.parts > 1 and (now.settling or now.parts**2 * len(self.model) <= s.most):
             self.model.divide(now.parts)
         widest = float(self.model.cell.max())

@@ -511,9 +511,10 @@ def prune_and_grow(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, share:
 def begin_bodies(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, reserve: Seeds) -> int:
     """Begin bodies that are missing, at places of the reserve away from all surfels.
 
-    A place must gain ``LONE`` nats on the spots that are looked at, divided by how much more the scores of
-    wall blocks scatter than counts do: a body is as bright for one part of the wall as for another, and what
-    the model lacks otherwise mostly is not.
+    A place must gain ``LONE`` nats on the spots that are looked at. They are divided by how much more the
+    scores of wall blocks scatter than counts do, since a body is as bright for one part of the wall as for
+    another, and what the model lacks otherwise mostly is not; or by how far the scores of all places go that
+    ask for less light (:func:`dispersion`), where that is more.
 
     Args:
         model: which gets more surfels; linked, its normals its own.
@@ -530,7 +531,8 @@ def begin_bodies(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, reserve:
     if not len(places.centre):
         return 0
     result = test.places(places)
-    gain = result.significance.clamp_min(0) ** 2 / 2 / result.scatter
+    unlike = result.scatter.clamp_min(dispersion(result.significance))
+    gain = result.significance.clamp_min(0) ** 2 / 2 / unlike
     begun = gain > LONE
     if not begun.any():
         return 0
@@ -545,10 +547,12 @@ def _add(model: SurfelModel, kept: Tensor, places: Seeds, gain: Tensor, light: T
     # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to
     # explain it otherwise.
     chosen = best_apart(places.centre, gain, apart)[: max(64, len(model) // 4)]
-    new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
+    new, begin, visible = places.take(chosen), FIRST_SHARE * light[chosen].float(), model.visible
     model.place(
         torch.cat([present.centre, new.centre]),
         torch.cat([present.normal, new.normal]),
         torch.cat([albedo, begin]),
     )
+    if len(visible):  # until it is worked out anew
+        model.visible = torch.cat([visible[:, kept], visible.new_ones(len(visible), len(chosen))], 1)
     return len(chosen)
