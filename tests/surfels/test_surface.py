@@ -22,7 +22,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import Hooks
 from nlos_lit.functional.surfel_graph import brightness, level_of
 from nlos_lit.model.build import PipelineSettings, build_pipeline
-from nlos_lit.surfels import start
+from nlos_lit.surfels import growth, start
 from nlos_lit.surfels.effect_start import asked_of, choose_shapes
 from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels
@@ -371,7 +371,7 @@ def test_a_body_that_is_missing_is_found(fitted):
 
 
 @pytest.mark.parametrize(("lit", "found"), [("everywhere", True), ("in a corner", False)])
-def test_light_that_is_missing_in_a_corner_alone_is_no_body(fitted, lit, found):
+def test_light_that_is_missing_in_a_corner_alone_is_no_body(fitted, monkeypatch, lit, found):
     """The same light twice, sixty times as bright where a ninth of the wall sees it alone."""
     capture, grid = fitted[0], fitted[3]
     model, train, _ = without_the_back(fitted)
@@ -387,6 +387,8 @@ def test_light_that_is_missing_in_a_corner_alone_is_no_body(fitted, lit, found):
     test = PlaceTest(model, capture, train, expected + light, expected)
     assert float(test.places(here).significance) > 5
     assert (begin_bodies(model, grid, test, here) == 1) == found
+    monkeypatch.setattr(growth, "dispersion", lambda scores: 25.0)
+    assert begin_bodies(model, grid, test, here) == 0, "places that ask for less light do so as strongly"
 
 
 def test_candidates_keep_apart():
