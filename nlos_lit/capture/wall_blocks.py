@@ -7,8 +7,8 @@ import numpy as np
 from nlos_lit.capture.capture import Capture
 
 
-def wall_blocks(capture: Capture, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Which patch of the wall every spot lies in, along both sides of what is scanned.
+def wall_blocks(capture: Capture, number: int) -> np.ndarray:
+    """Which patch of the wall every spot lies in.
 
     What is scanned are the sensor's points where they move, else the laser's.
 
@@ -17,10 +17,10 @@ def wall_blocks(capture: Capture, number: int) -> tuple[np.ndarray, np.ndarray]:
         number: patches along each side, of equal extent.
 
     Returns:
-        ``[S]`` rows and ``[S]`` columns of the patches, 0 to ``number - 1``.
+        ``[S]`` patches, from 0, row after row: ``divmod`` by ``number`` gives row and column.
     """
     points = [p for p in (capture.laser, capture.sensor) if np.ptp(p, axis=0).max() > 0]
     xy = points[-1][:, :2] if points else capture.laser[:, :2]
     low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
     place = np.minimum((xy - low) / extent * number, number - 1e-6).astype(int)
-    return place[:, 0], place[:, 1]
+    return place[:, 0] * number + place[:, 1]

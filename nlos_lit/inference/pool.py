@@ -234,9 +234,8 @@ def together(
 
     for free in (False, True) if effects else (True,):
         asked = [] if taken else [c for c in loud if c.free == free]
-        columns = {c.name: weighted_columns(problem, c.effect) for c in asked}
-        raw |= columns
-        freed |= _freed(projector, columns)
+        raw = {c.name: weighted_columns(problem, c.effect) for c in asked}
+        freed = _freed(projector, raw)
         while len(taken) < room:
             best = max((c.evidence for c in asked), default=0.0)
             near = [c for c in asked if c.evidence > max(least, MOST * best)]
@@ -429,34 +428,33 @@ def _parted(projector: Projector, terms: Iterable[tuple[Of, Tensor]]) -> Iterato
 
     A projection passes over all nuisance columns, however few it projects.
     """
-    for group in _grouped(terms):
-        freed, start = projector.freed(torch.cat([columns for _, columns in group], 1)), 0
-        for of, columns in group:
-            part = slice(start, start + columns.shape[1])
-            yield of, columns, Freed(*(each[:, part] for each in freed))
-            start = part.stop
+    for group, together, sizes in _grouped(terms):
+        parts = zip(*(each.split(sizes, 1) for each in projector.freed(together)), strict=True)
+        for (of, columns), part in zip(group, parts, strict=True):
+            yield of, columns, Freed(*part)
 
 
 def _freed(projector: Projector, terms: dict[str, Tensor]) -> dict[str, Tensor]:
     """Columns of several terms, by name, after the projector's first step; as many at once."""
     found = dict[str, Tensor]()
-    for group in _grouped(terms.items()):
-        freed = projector.free(torch.cat([columns for _, columns in group], 1))
-        parts = freed.split([columns.shape[1] for _, columns in group], 1)
-        found |= {name: part for (name, _), part in zip(group, parts, strict=True)}
+    for group, together, sizes in _grouped(terms.items()):
+        found |= dict(zip((name for name, _ in group), projector.free(together).split(sizes, 1), strict=True))
     return found
 
 
-def _grouped(terms: Iterable[tuple[Of, Tensor]]) -> Iterator[list[tuple[Of, Tensor]]]:
-    """Terms with their columns, about ``TOGETHER`` columns at a time."""
-    group: list[tuple[Of, Tensor]] = []
+def _grouped(
+    terms: Iterable[tuple[Of, Tensor]],
+) -> Iterator[tuple[list[tuple[Of, Tensor]], Tensor, list[int]]]:
+    """Terms with their columns, about ``TOGETHER`` of them at a time; those together, how many of each."""
+    group, sizes = list[tuple[Of, Tensor]](), list[int]()
     for term in terms:
         group.append(term)
-        if sum(columns.shape[1] for _, columns in group) >= TOGETHER:
-            yield group
-            group = []
+        sizes.append(term[1].shape[1])
+        if sum(sizes) >= TOGETHER:
+            yield group, torch.cat([columns for _, columns in group], 1), sizes
+            group, sizes = [], []
     if group:
-        yield group
+        yield group, torch.cat([columns for _, columns in group], 1), sizes
 
 
 def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[tuple[Shape, Tensor]]:

@@ -47,7 +47,8 @@ def split_spots(capture: Capture, blocks: int = 8) -> Split:
     Raises:
         UserError: a role is left without spots.
     """
-    row, column = wall_blocks(capture, blocks)
+    block = wall_blocks(capture, blocks)
+    row, column = np.divmod(block, blocks)
     role = np.array(ROLES)[(row + STRIDE * column) % len(ROLES)]
     first, last = capture.gate
     measured = capture.counts[:, first:last].any(1)
@@ -58,4 +59,4 @@ def split_spots(capture: Capture, blocks: int = 8) -> Split:
                 f"only {len(spots)} measured spots are left to {name}; "
                 "a diagnosis needs a scan of at least 16 × 16 spots"
             )
-    return Split(**parts, block=row * blocks + column)
+    return Split(**parts, block=block)

@@ -375,7 +375,7 @@ class SurfelFit:
                 self.finer, self.more = False, self.more if divided else 0
         elif tried is not None:
             self.bodies = max(0, self.bodies - 1)
-        if not above_noise:
+        if not above_noise or not (self.more or self.bodies):
             return
         model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
         undo = copy.deepcopy({"model": model, "extension": extension})
@@ -393,7 +393,6 @@ class SurfelFit:
         self.before, self.undo = nats, undo
 
     def _begin_bodies(self) -> int:
-        self.model.link()
         return begin_bodies(self.model, self.grid, self._place_test(), self.reserve)
 
     def _place_test(self) -> PlaceTest:

@@ -220,8 +220,7 @@ def score(
     offsets = quadrature(points, device)
     extent = torch.tensor(cell, device=device).abs()
     n = len(candidates.centre)
-    row, column = wall_blocks(capture, BLOCKS)
-    block = torch.from_numpy((row * BLOCKS + column)[rows]).to(device)
+    block = torch.from_numpy(wall_blocks(capture, BLOCKS)[rows]).to(device)
     total = torch.zeros(2, BLOCKS**2, n, dtype=torch.float64, device=device)
     size = max(1, CHUNK // (len(spots) * len(offsets)))
     for start in range(0, n, size):
@@ -245,10 +244,10 @@ def score(
 
 def _over_blocks(score: Tensor, information: Tensor, number: int) -> Score:
     """Sums over wall blocks of scores and information ``[blocks, V]``, ``number`` of which hold spots."""
-    both = Score(score.sum(0), information.sum(0), torch.ones(score.shape[1]))
-    albedo = (both.score / both.information.clamp_min(1e-30)).clamp_min(0)
+    total, known = score.sum(0), information.sum(0)
+    albedo = (total / known.clamp_min(1e-30)).clamp_min(0)
     away = (score - albedo * information).square() / information.clamp_min(1e-30)
-    return both._replace(scatter=(away.sum(0) / max(1, number - 1)).clamp_min(1.0))
+    return Score(total, known, (away.sum(0) / max(1, number - 1)).clamp_min(1.0))
 
 
 def continuations(centre: Tensor, normal: Tensor, cell: Tensor) -> tuple[Seeds, Tensor]:
@@ -454,10 +453,8 @@ class PlaceTest:
     def places(self, places: Seeds) -> Score:
         """Of places without a surfel, each seen past the surfels; their centres stand for them."""
         model = self.model
-        hidden = len(model.visible) > 0
-        return self._score(
-            places, 1, model.arriving(model.sees(self.spots, places.centre)) if hidden else None
-        )
+        visible = model.arriving(model.sees(self.spots, places.centre)) if len(model.visible) else None
+        return self._score(places, 1, visible)
 
     def _score(self, places: Seeds, points: int, visible: Tensor | None) -> Score:
         cell, sensor = (float(self.model.cell[0]), float(self.model.cell[1])), self.model.laser_sensor
@@ -517,7 +514,7 @@ def begin_bodies(model: SurfelModel, grid: VolumeGrid, test: PlaceTest, reserve:
     ask for less light (:func:`dispersion`), where that is more.
 
     Args:
-        model: which gets more surfels; linked, its normals its own.
+        model: which gets more surfels; its normals its own.
         grid: whose depths bound the volume.
         test: of places beside it.
         reserve: places where one may be, each of which is tried with several normals.
