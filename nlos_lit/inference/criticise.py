@@ -646,9 +646,9 @@ def criticise(
         if held.coarse is not coarse and not free:
             coarse = held.coarse
             pool = asked(effects=False)
-    found.members, scene = loop.single_spots(found.members, held.scene)
+    found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
-        found.members, found.final = loop.named(found.members, scene)
+        found.final = scene
         found.again = loop.only(held.coarse, [m.name for m in found.accepted])
     else:
         found.members = [replace(m, accepted=False) for m in found.members]
