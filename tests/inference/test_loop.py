@@ -445,6 +445,18 @@ def test_terms_must_predict_better_than_a_finer_scene(monkeypatch):
         assert (found.again is None) is not names or names
 
 
+@pytest.mark.parametrize(("rival", "named"), [(70.0, {"irf_tail"}), (59.0, set())])
+def test_a_rival_may_predict_better_than_a_finer_scene(monkeypatch, rival, named):
+    """Where the term in whose place it stands does not."""
+    table = {"fine": nats(60.0), "afterpulsing": nats(55.0), "irf_tail": nats(rival)}
+    table |= {"fine+afterpulsing": nats(40.0), "fine+anew+afterpulsing": nats(40.0)}
+    rivals = {"afterpulsing": ["irf_tail"]}
+    found = World(monkeypatch, table, [candidate("afterpulsing")], rivals=rivals).criticise()
+    assert found.final.names == named
+    assert {m.name for m in found.accepted} == named
+    assert (found.again is not None) is bool(named)
+
+
 @pytest.mark.parametrize(("evidence", "named"), [(LEAST + 0.1, True), (LEAST - 0.1, False)])
 def test_what_single_spots_have_over_their_neighbours_needs_no_share_of_the_misfit(
     monkeypatch, evidence, named
