@@ -9,6 +9,7 @@ from torch import Tensor
 
 NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to exp(-1/2)
 RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present normal by far, none do not
+ARCS = 2  # times that planes are laid again through neighbours on an arc: a plane faces the middle of it
 AVERAGES = 6  # over neighbours, by which a shift is carried along a sheet
 STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the places
 BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
@@ -62,6 +63,7 @@ class Sheet(NamedTuple):
     second: Tensor  # [M, 3] unit, across both
     share: Tensor  # [P, 2] slopes along both, per metre that j stands out of i's plane, beyond
     rest: Tensor  # [P] m, as far as it may while i keeps this normal
+    bow: Tensor  # [P] m, as far as an arc from i to j leaves i's plane, that is at rest
     mean: Tensor  # [P] share of j in the average about i
     own: Tensor  # [M] share of i in it
 
@@ -107,7 +109,9 @@ def lay_sheet(
     share = torch.linalg.solve(normal_equations[i], trust[:, None] * along)
     total = weight.clamp_min(1e-6).index_add(0, i, trust)
     rest = height if as_it_is else torch.zeros_like(height)
-    return Sheet(pairs, normal, first, second, share, rest, trust / total[i], weight.clamp_min(1e-6) / total)
+    bow = _bow(normal, d, pairs) if as_it_is else torch.zeros_like(height)
+    mean, own = trust / total[i], weight.clamp_min(1e-6) / total
+    return Sheet(pairs, normal, first, second, share, rest, bow, mean, own)
 
 
 def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
@@ -140,6 +144,10 @@ def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
 def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
     """Normals of surfels whose neighbours are where they are now.
 
+    A plane through the neighbours on one side of a surfel, at the rim of a round body, is turned towards
+    them by half of what the surface bends. So it is laid again, ``ARCS`` times, through neighbours as far out
+    of it as an arc that has both normals would take them. Where neighbours are all around nothing changes.
+
     Args:
         sheet: from :func:`lay_sheet`.
         centre: ``[M, 3]`` m, differentiable.
@@ -159,14 +167,31 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
         tensor([0., 0., 1.])
         >>> risen = flat + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
         >>> [round(x, 2) for x in sheet_normals(sheet, risen)[1].tolist()]
-        [0.64, 0.0, -0.77]
+        [0.67, 0.0, -0.74]
     """
     i, j = sheet.pairs
     d = centre.index_select(0, j) - centre.index_select(0, i)
     height = (d * sheet.normal.index_select(0, i)).sum(1) - sheet.rest
-    slope = torch.zeros(len(centre), 2, device=centre.device).index_add(0, i, sheet.share * height[:, None])
+    normal = _leaning(sheet, height)
+    for _ in range(ARCS):
+        normal = _leaning(sheet, height + _bow(normal, d, sheet.pairs) - sheet.bow)
+    return normal
+
+
+def _leaning(sheet: Sheet, height: Tensor) -> Tensor:
+    """``[M, 3]`` normals of planes through neighbours that stand out by ``height`` ``[P]``."""
+    slope = height.new_zeros(len(sheet.own), 2).index_add(0, sheet.pairs[0], sheet.share * height[:, None])
     leaning = sheet.normal - slope[:, :1] * sheet.first - slope[:, 1:] * sheet.second
     return torch.nn.functional.normalize(leaning, dim=1)
+
+
+def _bow(normal: Tensor, d: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
+    """``[P]`` m by which an arc with both normals leaves the first one's plane along ``d`` ``[P, 3]``.
+
+    On it ``(n_i + n_j)·d = 0``, so that ``-n_i·d`` is half of ``(n_j - n_i)·d``.
+    """
+    i, j = pairs
+    return ((normal.index_select(0, j) - normal.index_select(0, i)) * d).sum(1) / 2
 
 
 def misfits(centre: Tensor, normal: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
