@@ -532,25 +532,21 @@ def test_normals_follow_places_while_a_sheet_is_laid(fitted):
     assert torch.allclose(model.normal(), kept)
 
 
-def test_normals_at_a_rim_are_those_of_a_round_body(monkeypatch):
-    """Half of a tube, cut where it stands upright; planes through neighbours on one side face inwards."""
+def test_normals_at_a_rim_are_those_of_a_round_body():
+    """Half of a tube, cut where it stands upright. Planes through neighbours on one side face inwards by half
+    of what the surface bends to the next ones, 7.4°.
+    """
     angle = torch.linspace(-1.3, 1.3, 11)
     along = torch.arange(7) * 0.26
     x, y = (v.reshape(-1) for v in torch.meshgrid(angle, along, indexing="ij"))
     true = torch.stack([x.sin(), torch.zeros_like(x), -x.cos()], 1)
     centre = torch.stack([true[:, 0], y, true[:, 2]], 1)
     pairs = graph.neighbour_pairs(centre, true, 0.42)
-
-    def degrees_off() -> torch.Tensor:
-        sheet = graph.lay_sheet(centre, true, torch.ones(len(centre)), pairs, 0.26)
-        cosine = (graph.sheet_normals(sheet, centre) * true).sum(1).clamp(-1, 1)
-        return torch.rad2deg(torch.arccos(cosine)).view(11, 7)[:, 3]
-
-    better = degrees_off()
-    monkeypatch.setattr(graph, "ARCS", 0)
-    planes = degrees_off()
-    assert planes[[0, -1]].min() > 6
-    assert better.max() < 2
+    sheet = graph.lay_sheet(centre, true, torch.ones(len(centre)), pairs, 0.26)
+    cosine = (graph.sheet_normals(sheet, centre) * true).sum(1).clamp(-1, 1)
+    off = torch.rad2deg(torch.arccos(cosine)).view(11, 7)[:, 3]
+    assert off.max() < 3.5
+    assert off[2:-2].max() < 0.1
 
 
 def test_a_sheet_that_is_laid_as_it_is_begins_with_its_own_normals(fitted):
