@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -65,6 +66,7 @@ class Sheet(NamedTuple):
     bow: Tensor  # [P] m, as far as an arc from i to j leaves i's plane, that is at rest
     mean: Tensor  # [P] share of j in the average about i
     own: Tensor  # [M] share of i in it
+    rim: Tensor  # [M] how far neighbours lie to one side: 0 all around, 1 where half of them are missing
 
 
 def lay_sheet(
@@ -110,7 +112,10 @@ def lay_sheet(
     rest = height if as_it_is else torch.zeros_like(height)
     bow = _bow(normal, d, pairs) if as_it_is else torch.zeros_like(height)
     mean, own = trust / total[i], weight.clamp_min(1e-6) / total
-    return Sheet(pairs, normal, first, second, share, rest, bow, mean, own)
+    aside = torch.zeros_like(normal[:, :2]).index_add(0, i, trust[:, None] * along).norm(dim=1)
+    reach = torch.zeros_like(aside).index_add(0, i, trust * along.norm(dim=1))
+    rim = (math.pi / 2 * aside / reach.clamp_min(1e-12)).clamp_max(1.0)
+    return Sheet(pairs, normal, first, second, share, rest, bow, mean, own, rim)
 
 
 def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
@@ -145,7 +150,8 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
 
     A plane through the neighbours on one side of a surfel, at the rim of a round body, is turned towards
     them by half of what the surface bends. So it is laid again, through neighbours as far out of it as an arc
-    that has both normals would take them. Where neighbours are all around nothing changes.
+    that has both normals would take them. Where neighbours are all around their bends cancel, and would bring
+    nothing but the noise of their normals.
 
     Args:
         sheet: from :func:`lay_sheet`.
@@ -166,13 +172,14 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
         tensor([0., 0., 1.])
         >>> risen = flat + torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1], [0.0, 0.0, 0.2]])
         >>> [round(x, 2) for x in sheet_normals(sheet, risen)[1].tolist()]
-        [0.66, 0.0, -0.75]
+        [0.64, 0.0, -0.77]
     """
     i, j = sheet.pairs
     d = centre.index_select(0, j) - centre.index_select(0, i)
     height = (d * sheet.normal.index_select(0, i)).sum(1) - sheet.rest
     planes = _leaning(sheet, height)
-    return _leaning(sheet, height + _bow(planes, d, sheet.pairs) - sheet.bow)
+    bow = sheet.rim.index_select(0, i) * (_bow(planes, d, sheet.pairs) - sheet.bow)
+    return _leaning(sheet, height + bow)
 
 
 def _leaning(sheet: Sheet, height: Tensor) -> Tensor:
