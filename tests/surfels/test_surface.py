@@ -151,8 +151,10 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
         result = fit_surfels(capture, intensity, grid, settings, train, progress=progress)
         deviances.append(score_spots(result.model, capture, torch.from_numpy(train)).deviance_per_bin)
         results.append(result)
-    assert [len(result.history) for result in results] == [1, 3, 5], "one looked for bodies"
-    assert deviances[0] > deviances[1] > deviances[2]
+    plain, once, most = (len(result.history) for result in results)
+    assert (plain, once) == (1, 3), "one looked for bodies"
+    assert once < most <= 1 + 1 + 3
+    assert deviances[0] > deviances[1] >= deviances[2], "a round that does not help is undone"
     of = dict(seen)
     assert [k for k, _ in seen] == list(range(1, 121))
     assert [of[k] for k in (40, 41, 80, 81, 120)] == [40, 80, 80, 120, 120]
