@@ -13,8 +13,8 @@ from torch import Tensor
 
 from nlos_lit.functional.surfel_paths import quadrature, spread
 
-DRAWN = 3  # points along each side of a patch that are drawn
-PIXEL = 0.4  # of a cell, for the nearest patches: a little more than those points lie apart on slanted ones
+DRAWN = 5  # points along each side of a patch that are drawn
+PIXEL = 0.35  # of a cell, for the nearest patches: more than those points lie apart on slanted ones
 NEAR = 0.02  # share of the patches that may lie nearer to the wall than their pixels are fine for
 CLEAR = 1.0  # cells behind a patch's plane up to which it hides nothing: neighbours on a curved sheet
 STEPS = 1 << 20  # of depth a metre, and surfels, at most, that fit into one number with it
@@ -25,30 +25,32 @@ def clear_view(
 ) -> Tensor:
     """Which straight lines from wall points to targets do not pierce a patch.
 
-    What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel: 0.4 of a
-    cell for the nearest patches, one cell for those 2.5 times farther away.
+    What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel: 0.35 of a
+    cell for the nearest patches, one cell for those 2.9 times farther away. A target may be an extended one,
+    of K points: each lies in a pixel of its own, and their middle says on which side of a plane they are, so
+    that a curved sheet does not hide the corners of its own flat patches.
 
     Args:
         centre: ``[M, 3]`` m, of the patches that hide.
         normal: ``[M, 3]`` unit.
         cell: ``[2]`` lateral extents of a patch, m.
         wall: ``[W, 3]`` wall points, m.
-        target: ``[V, 3]`` m.
+        target: ``[V, K, 3]`` m, points of each target.
         chunk: points and pixels worked on at once, bounds the memory.
 
     Returns:
-        ``[W, V]`` bool, True where the view is clear.
+        ``[W, V, K]`` bool, True where the view is clear.
 
     Examples:
         A patch half-way hides what is straight behind it from the first wall point, not from the second:
 
         >>> half_way, towards = torch.tensor([[0.0, 0.0, 0.5]]), torch.tensor([[0.0, 0.0, -1.0]])
         >>> wall = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
-        >>> clear_view(half_way, towards, torch.tensor([0.1, 0.1]), wall, torch.tensor([[0.0, 0.0, 1.0]]))
-        tensor([[False],
-                [ True]])
+        >>> behind = torch.tensor([[[0.0, 0.0, 1.0]]])
+        >>> clear_view(half_way, towards, torch.tensor([0.1, 0.1]), wall, behind).flatten()
+        tensor([False,  True])
     """
-    clear = torch.ones(len(wall), len(target), dtype=torch.bool, device=wall.device)
+    clear = torch.ones(len(wall), *target.shape[:2], dtype=torch.bool, device=wall.device)
     if not len(centre):
         return clear
     shift, _ = spread(normal, cell, quadrature(DRAWN, cell.device))
@@ -56,10 +58,12 @@ def clear_view(
     patch = torch.arange(len(centre), device=wall.device).repeat_interleave(DRAWN**2)
     side, front = cell.max(), wall[:, 2].max()
     nearest = (torch.quantile(centre[:, 2], NEAR) - front).clamp_min(side)
-    behind = torch.nonzero(target[:, 2] - front > nearest)[:, 0]
+    middle = target.mean(1)
+    behind = torch.nonzero(middle[:, 2] - front > nearest)[:, 0]
     if not len(behind):
         return clear
-    target = target[behind]
+    middle = middle[behind].repeat_interleave(target.shape[1], 0)
+    target = target[behind].reshape(-1, 3)
     pixel = PIXEL * side / nearest
     level = (normal * centre).sum(1)  # of each patch's plane
     # No line of sight leaves the box around wall and targets: at most so many pixels across.
@@ -82,9 +86,10 @@ def clear_view(
         hider = torch.where(at_front, found % STEPS, 0)
         n = normal[hider]
         plane = level[hider]
-        own = (n * target).sum(2) - plane
+        own = (n * middle).sum(2) - plane
         eye = (n * part[:, None]).sum(2) - plane
-        clear[rows, behind] = ~(at_front & (own * eye < 0) & (own.abs() > CLEAR * side))
+        hidden = at_front & (own * eye < 0) & (own.abs() > CLEAR * side)
+        clear[rows, behind] = ~hidden.view(len(part), len(behind), -1)
     return clear
 
 

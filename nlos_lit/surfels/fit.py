@@ -458,9 +458,10 @@ class SurfelFit:
         self._hide(now.outline)
         if now.outline:
             prior = (s.evenness, s.brightness)
+            before = self.model.albedo().detach()
             extend(self.model, self.grid, spots)
             solve_albedos(self.model, spots, counts, *prior, SEARCH, self.extension)
-            cut_back(self.model)
+            cut_back(self.model, before)
             self._hide()
             solve_albedos(self.model, spots, counts, *prior, MEND, self.extension)
 

@@ -453,7 +453,8 @@ class PlaceTest:
     def places(self, places: Seeds) -> Score:
         """Of places without a surfel, each seen past the surfels; their centres stand for them."""
         model = self.model
-        visible = model.arriving(model.sees(self.spots, places.centre)) if len(model.visible) else None
+        seen = model.sees(self.spots, places.centre[:, None]) if len(model.visible) else None
+        visible = None if seen is None else model.arriving(seen)
         return self._score(places, 1, visible)
 
     def _score(self, places: Seeds, points: int, visible: Tensor | None) -> Score:

@@ -38,6 +38,8 @@ from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
 OPAQUE = (0.6, 0.2, 0.05)  # of the mean albedo: surfels that are fainter than one of these hide nothing
+LOOKED = 2  # points along each side of a surfel at which it is looked whether it is in view
+SHARE = torch.float16  # quarters are exact
 
 
 class Lateral(NamedTuple):
@@ -69,7 +71,7 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
-        visible: ``[S, M]`` which surfels each spot sees; ``[0, M]`` where all see all.
+        visible: ``[S, M]`` share of each surfel that each spot sees; ``[0, M]`` where all see all.
         opaque: share of the mean albedo below which surfels hide nothing.
         observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
         pairs: neighbours on one sheet, see :meth:`link`.
@@ -134,7 +136,7 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
-        self.register_buffer("visible", torch.ones(0, len(centre), dtype=torch.bool, device=device))
+        self.register_buffer("visible", torch.ones(0, len(centre), dtype=SHARE, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
         self.raw_shift = nn.Parameter(torch.zeros(len(centre), device=device))  # neighbours come along
@@ -246,25 +248,30 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def update_visibility(self, spots: Tensor | None = None) -> None:
-        """Find which surfels each spot sees, see :meth:`sees`.
+        """Find what each spot sees of each surfel, at ``LOOKED`` × ``LOOKED`` points: see :meth:`sees`.
 
         Args:
             spots: ``[B]`` rows of the capture; the others see all. None finds it for every spot.
         """
         rows = torch.arange(len(self.laser), device=self.laser.device) if spots is None else spots
-        self.visible = torch.ones(len(self.laser), len(self), dtype=torch.bool, device=self.laser.device)
-        self.visible[rows] = self.sees(rows, self.centre())
+        self.visible = torch.ones(len(self.laser), len(self), dtype=SHARE, device=self.laser.device)
+        self.visible[rows] = self.sees(rows, self.points_of(*self.placed()))
+
+    def points_of(self, centre: Tensor, normal: Tensor) -> Tensor:
+        """``[V, K, 3]`` points of surfels at which it is looked whether they are in view."""
+        shift, _ = spread(normal, self.cell, quadrature(LOOKED, self.cell.device))
+        return centre[:, None] + shift
 
     @torch.no_grad()
     def sees(self, spots: Tensor, places: Tensor) -> Tensor:
-        """Which places the surfels leave in view of laser and sensor; those below ``opaque`` hide nothing.
+        """What the surfels leave in view of laser and sensor; those below ``opaque`` hide nothing.
 
         Args:
             spots: ``[B]`` rows of the capture.
-            places: ``[V, 3]`` m.
+            places: ``[V, K, 3]`` m, K points of each place.
 
         Returns:
-            ``[B, V]`` bool.
+            ``[B, V]`` share of the points that both see.
         """
         albedo, (centre, normal) = self.albedo(), self.placed()
         solid = albedo > self.opaque * albedo.mean()
@@ -274,7 +281,7 @@ class SurfelModel(nn.Module):
             return clear_view(centre[solid], normal[solid], self.cell, points, places)[row]
 
         clear = seen(self.laser[spots])
-        return clear if self.confocal else clear & seen(self.sensor[spots])
+        return (clear if self.confocal else clear & seen(self.sensor[spots])).to(SHARE).mean(2)
 
     def paths(self, spots: Tensor) -> Paths:
         """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
@@ -300,12 +307,12 @@ class SurfelModel(nn.Module):
         """Share of the light that arrives: all where the view is clear, :meth:`passing` where it is not.
 
         Args:
-            visible: ``[B, V]`` bool.
+            visible: ``[B, V]`` share that is in view.
 
         Returns:
             ``[B, V]``.
         """
-        return torch.where(visible, torch.ones_like(self.raw_passing), self.passing())
+        return torch.lerp(self.passing(), self.raw_passing.new_ones(()), visible.to(self.raw_passing))
 
     def arrival(self, length: Tensor) -> Tensor:
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""

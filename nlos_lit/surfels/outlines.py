@@ -50,8 +50,8 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         )
     visible = model.visible
     if len(visible):
-        seen = torch.ones(len(visible), len(centre) - present, dtype=torch.bool, device=visible.device)
-        seen[spots] = model.sees(spots, centre[present:])
+        seen = visible.new_ones(len(visible), len(centre) - present)
+        seen[spots] = model.sees(spots, model.points_of(centre[present:], normal[present:]))
         visible = torch.cat([visible, seen], 1)
     model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]))
     if len(visible):
@@ -113,11 +113,17 @@ def solve_albedos(
 
 
 @torch.no_grad()
-def cut_back(model: SurfelModel) -> None:
+def cut_back(model: SurfelModel, before: Tensor) -> None:
     """Leave out surfels fainter than ``DIM`` of the scene's level.
+
+    What was brighter before its neighbours were extended stays: it hides what is behind it, and its light may
+    have gone to new ones beside it, which are too faint to stay themselves.
 
     Args:
         model: of the surfels.
+        before: ``[N]`` albedos of the first N surfels, those that were there, before the others came.
     """
     albedo = model.albedo()
-    model.keep(albedo > DIM * level_of(albedo))
+    kept = albedo > DIM * level_of(albedo)
+    kept[: len(before)] |= before > DIM * level_of(before)
+    model.keep(kept)

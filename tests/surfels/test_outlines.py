@@ -133,13 +133,17 @@ def test_faint_surfels_are_not_extended():
     assert model.centre()[:, 0].max() > 0.05 + RINGS * CELL
 
 
-@pytest.mark.parametrize(("share", "stays"), [(0.95, False), (1.05, True)])
-def test_surfels_below_a_share_of_the_level_go(share, stays):
+@pytest.mark.parametrize(
+    ("before", "share", "stays"),
+    [(0.95, 0.95, False), (0.95, 1.05, True), (1.05, 0.95, True), (None, 0.95, False), (None, 1.05, True)],
+)
+def test_surfels_go_that_are_dim_and_were_dim_or_new(before, share, stays):
     albedo = torch.ones(3, 3)
-    albedo[1, 1] = share * DIM
+    albedo[2, 2] = share * DIM
     model = board(albedo)
     assert level_of(model.albedo()).item() == pytest.approx(1.0, rel=1e-5)
-    cut_back(model)
+    known = torch.ones(8) if before is None else torch.tensor([1.0] * 8 + [before * DIM])
+    cut_back(model, known)
     assert len(model) == (9 if stays else 8)
 
 

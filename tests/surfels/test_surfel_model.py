@@ -266,13 +266,31 @@ def test_faint_surfels_hide_nothing(opaque, share, hides):
     model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], *others], albedo=[albedo, 1.0, 1.0, 1.0])
     model.opaque = opaque
     model.update_visibility()
-    assert model.visible.tolist() == [[True, not hides, True, True]]
+    assert model.visible.tolist() == [[1.0, float(not hides), 1.0, 1.0]]
+
+
+def test_a_surfel_is_seen_in_part_past_an_edge():
+    capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], [0.5, 0.0, 0.5]])
+    cell = float(model.cell[0])
+    # The one in front ends at half a cell, so that a cell's width is hidden twice as far away.
+    for aside, share in ((0.0, 0.0), (1.0, 0.5), (2.0, 1.0)):
+        centre = torch.tensor([[0.0, 0.0, 0.5], [aside * cell, 0.0, 1.0], [0.5, 0.0, 0.5]])
+        model.place(centre, model.normal().detach(), torch.ones(3))
+        model.update_visibility()
+        assert model.visible.tolist() == [[1.0, share, 1.0]]
+        dark = model.laser_sensor.background().item()
+        seen, spots = model.render(torch.tensor([0])) - dark, torch.tensor([0])
+        model.visible = torch.ones_like(model.visible)
+        model.set_albedo(torch.tensor([1.0, share, 1.0]))
+        assert torch.allclose(seen, model.render(spots) - dark, rtol=1e-4, atol=1e-5)
+        model.set_albedo(torch.ones(3))
 
 
 def test_a_share_passes_what_stands_in_front():
     model, spots = random_model()
     open_view = model.render(spots)
-    model.visible = torch.zeros(len(model.laser), len(model), dtype=torch.bool)
+    model.visible = torch.zeros(len(model.laser), len(model))
     dark = model.render(spots)
     assert torch.allclose(dark, model.laser_sensor.background().expand_as(dark), atol=1e-6)
     model.set_passing(0.25)
