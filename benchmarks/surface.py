@@ -195,7 +195,6 @@ def fit_rows(case: Case, options: dict[str, str]) -> None:
             **dataclasses.asdict(scores),
             "surfels": len(found.model),
             "rounds": len(found.history),
-            "passing": found.history[-1]["passing"],
             "cpu_seconds": seconds,
             "seconds": wall,
             "counts_per_spot": float(capture.gated_counts().sum() / capture.n_spots),

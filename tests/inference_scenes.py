@@ -100,10 +100,12 @@ def surfels(scene: Capture, number: int = 12, level: float = 1.0) -> SurfelModel
 
 
 def hide_some(model: SurfelModel) -> None:
-    """A quarter of the surfels is hidden from each wall point, but for three tenths of their light."""
-    shape = (len(model.laser), len(model))
-    model.visible = torch.from_numpy(np.random.default_rng(8).random(shape) > 0.25)
-    model.set_passing(0.3)
+    """A quarter of the surfels' points is hidden from each wall point by others, but for a part of the light."""
+    gen, m = np.random.default_rng(8), len(model)
+    shape = (1 if model.confocal else 2, len(model.laser), m, 4)
+    hidden, by = gen.random(shape) > 0.75, gen.integers(1, m + 1, shape)
+    model.hiders = torch.from_numpy(np.where(hidden, by, 0).astype(np.int32))
+    model.set_opacity(torch.from_numpy(gen.uniform(0.3, 0.9, m)).to(model.raw_opacity))
 
 
 def effect_of(name: str, scan: Scan, **values: float | Tensor) -> Effect:

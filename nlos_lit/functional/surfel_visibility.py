@@ -20,10 +20,10 @@ CLEAR = 1.0  # cells behind a patch's plane up to which it hides nothing: neighb
 STEPS = 1 << 20  # of depth a metre, and surfels, at most, that fit into one number with it
 
 
-def clear_view(
+def who_hides(
     centre: Tensor, normal: Tensor, cell: Tensor, wall: Tensor, target: Tensor, chunk: int = 1 << 19
 ) -> Tensor:
-    """Which straight lines from wall points to targets do not pierce a patch.
+    """The first patch that straight lines from wall points to targets pierce.
 
     What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel: 0.35 of a
     cell for the nearest patches, one cell for those 2.9 times farther away. A target may be an extended one,
@@ -39,7 +39,7 @@ def clear_view(
         chunk: points and pixels worked on at once, bounds the memory.
 
     Returns:
-        ``[W, V, K]`` bool, True where the view is clear.
+        ``[W, V, K]`` int32, which patch; -1 where the view is clear.
 
     Examples:
         A patch half-way hides what is straight behind it from the first wall point, not from the second:
@@ -47,12 +47,12 @@ def clear_view(
         >>> half_way, towards = torch.tensor([[0.0, 0.0, 0.5]]), torch.tensor([[0.0, 0.0, -1.0]])
         >>> wall = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
         >>> behind = torch.tensor([[[0.0, 0.0, 1.0]]])
-        >>> clear_view(half_way, towards, torch.tensor([0.1, 0.1]), wall, behind).flatten()
-        tensor([False,  True])
+        >>> who_hides(half_way, towards, torch.tensor([0.1, 0.1]), wall, behind).flatten()
+        tensor([ 0, -1], dtype=torch.int32)
     """
-    clear = torch.ones(len(wall), *target.shape[:2], dtype=torch.bool, device=wall.device)
+    found_by = target.new_full((len(wall), *target.shape[:2]), -1, dtype=torch.int32)
     if not len(centre):
-        return clear
+        return found_by
     shift, _ = spread(normal, cell, quadrature(DRAWN, cell.device))
     drawn = (centre[:, None] + shift).reshape(-1, 3)
     patch = torch.arange(len(centre), device=wall.device).repeat_interleave(DRAWN**2)
@@ -61,7 +61,7 @@ def clear_view(
     middle = target.mean(1)
     behind = torch.nonzero(middle[:, 2] - front > nearest)[:, 0]
     if not len(behind):
-        return clear
+        return found_by
     middle = middle[behind].repeat_interleave(target.shape[1], 0)
     target = target[behind].reshape(-1, 3)
     pixel = PIXEL * side / nearest
@@ -89,8 +89,9 @@ def clear_view(
         own = (n * middle).sum(2) - plane
         eye = (n * part[:, None]).sum(2) - plane
         hidden = at_front & (own * eye < 0) & (own.abs() > CLEAR * side)
-        clear[rows, behind] = ~hidden.view(len(part), len(behind), -1)
-    return clear
+        by = torch.where(hidden, hider, -1).to(torch.int32)
+        found_by[rows, behind] = by.view(len(part), len(behind), -1)
+    return found_by
 
 
 def _seen_from(wall: Tensor, points: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor, Tensor]:

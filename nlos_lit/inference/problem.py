@@ -128,9 +128,10 @@ def build_problem(
         surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
-        if len(model.visible):
+        if len(model.hiders):
             whole = _Forward(model, extension, partial(_render, part))
-            both.append(_jvp(whole, "model.raw_passing", model.raw_passing, torch.tensor(1.0)))
+            opacity = model.raw_opacity.detach()
+            both.append(_jvp(whole, "model.raw_opacity", opacity, torch.ones_like(opacity)))
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]
@@ -323,7 +324,7 @@ def _transient_columns(
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
     walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
     offsets = quadrature(model.quadrature, centre.device)
-    seen = model.arriving(model.visible[spots])[:, :, None] if len(model.visible) else 1.0
+    seen = model.arriving(model.hiders[:, spots]).detach()[:, :, None] if len(model.hiders) else 1.0
 
     def place(rho: Tensor, depth: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
         moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction

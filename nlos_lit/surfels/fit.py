@@ -21,7 +21,7 @@ from nlos_lit.functional.surfel_graph import Sheet
 from nlos_lit.metrics.transients import Scores, transient_scores
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import PlaceTest, Seeds, begin_bodies, prune_and_grow
-from nlos_lit.surfels.model import OPAQUE, SurfelModel, points_along
+from nlos_lit.surfels.model import SurfelModel, points_along, unknown_opacity
 from nlos_lit.surfels.outlines import MEND, SEARCH, cut_back, extend, solve_albedos
 
 Progress = Callable[[int, int], None]
@@ -51,7 +51,7 @@ class SurfelSettings:
         more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back.
-        albedo_rate, response_rate: of the unconstrained values.
+        albedo_rate, opacity_rate, response_rate: of the unconstrained values.
         effect_rate: of physical effects, in their own noticeable steps.
         bending: weight against neighbours that do not fit one surface (:meth:`SurfelModel.bending`); 1 takes
             it for the logarithm of a prior.
@@ -78,6 +78,7 @@ class SurfelSettings:
     batch: int = 24
     depth_rate: float = 0.15
     albedo_rate: float = 0.08
+    opacity_rate: float = 0.2
     response_rate: float = 0.03
     effect_rate: float = 0.1
     bending: float = 0.5
@@ -455,6 +456,8 @@ class SurfelFit:
         widest = float(self.model.cell.max())
         points = s.quadrature or points_along(widest, self.model.bin_length)
         self.model.quadrature = 1 if now.contest else points
+        if now.settling:
+            self.model.set_opacity(unknown_opacity(self.model.albedo().detach()))
         self._hide(now.outline)
         if now.outline:
             prior = (s.evenness, s.brightness)
@@ -465,25 +468,11 @@ class SurfelFit:
             self._hide()
             solve_albedos(self.model, spots, counts, *prior, MEND, self.extension)
 
-    @torch.no_grad()
     def _hide(self, tested_only: bool = False) -> None:
-        """Who hides whom, and from what albedo on: one of ``OPAQUE``, whichever makes the counts likeliest.
-
-        False surfels are faint, and must not hide what is true; dark surfaces are faint, and hide.
-
-        Args:
-            tested_only: the other spots see all, until the next call.
+        """Who hides whom; with ``tested_only`` for the tested spots, and the others see all until the next.
         """
-        if not self.settings.visibility:
-            return
-        counts, spots, found = self.counts[self.tested], self.train[self.tested], []
-        for opaque in OPAQUE:
-            self.model.opaque = opaque
-            self.model.update_visibility(spots)
-            expected = self.model.expected(spots, self.extension).clamp_min(1e-9)
-            found.append((float((torch.xlogy(counts, expected) - expected).double().sum()), opaque))
-        self.model.opaque = max(found)[1]
-        self.model.update_visibility(spots if tested_only else None)
+        if self.settings.visibility:
+            self.model.update_hiders(self.train[self.tested] if tested_only else None)
 
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""
@@ -491,10 +480,12 @@ class SurfelFit:
         # The response waits for the places: it would otherwise settle around errors of the seeds.
         response_rate = s.response_rate * (0.3 if self.plan[0].settling else 1.0)
         settled = [] if self.plan[0].contest else [model.raw_depth, model.raw_shift]
-        response = [] if self.plan[0].contest else [*model.laser_sensor.parameters(), model.raw_passing]
+        response = [] if self.plan[0].contest else [*model.laser_sensor.parameters()]
+        opacity = [] if self.plan[0].contest else [model.raw_opacity]
         groups = [
             {"params": settled, "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
+            {"params": opacity, "lr": s.opacity_rate},
             {"params": response, "lr": response_rate},
             {"params": self._effect_parameters(), "lr": s.effect_rate},
         ]
@@ -577,8 +568,7 @@ class SurfelFit:
             self._drop_faint()
         sensor = {name: p().item() for name, p in self.model.laser_sensor.named_children()}
         loss = float(np.mean(self.losses[-len(self.losses) // 4 :]))
-        passing = self.model.passing().item()
-        self.history.append({"surfels": len(self.model), "loss": loss, **sensor, "passing": passing})
+        self.history.append({"surfels": len(self.model), "loss": loss, **sensor})
         self.plan, self.losses, self.optimizer = self.plan[1:], [], None
         self._add_round()
 

@@ -34,7 +34,7 @@ from nlos_lit.functional.surfel_paths import (
 )
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor, unknown_opacity
 
 CHUNK = 1 << 21  # paths at a time
 BLOCKS = 6  # along each side of the wall, between which scores are held against each other
@@ -447,15 +447,18 @@ class PlaceTest:
     def surfels(self) -> Score:
         """Of the surfels themselves, with the light that they are seen by."""
         model = self.model
-        visible = model.arriving(model.visible[self.spots]) if len(model.visible) else None
+        visible = self._seen(model.hiders[:, self.spots]) if len(model.hiders) else None
         return self._score(Seeds(*model.placed()), model.quadrature, visible)
 
     def places(self, places: Seeds) -> Score:
         """Of places without a surfel, each seen past the surfels; their centres stand for them."""
         model = self.model
-        seen = model.sees(self.spots, places.centre[:, None]) if len(model.visible) else None
-        visible = None if seen is None else model.arriving(seen)
-        return self._score(places, 1, visible)
+        hidden = model.hidden_by(self.spots, places.centre[:, None]) if len(model.hiders) else None
+        return self._score(places, 1, None if hidden is None else self._seen(hidden))
+
+    @torch.no_grad()
+    def _seen(self, hiders: Tensor) -> Tensor:
+        return self.model.arriving(hiders)
 
     def _score(self, places: Seeds, points: int, visible: Tensor | None) -> Score:
         cell, sensor = (float(self.model.cell[0]), float(self.model.cell[1])), self.model.laser_sensor
@@ -545,12 +548,17 @@ def _add(model: SurfelModel, kept: Tensor, places: Seeds, gain: Tensor, light: T
     # A misfit that is not the surface's asks for light everywhere; growing by shares gives the fit time to
     # explain it otherwise.
     chosen = best_apart(places.centre, gain, apart)[: max(64, len(model) // 4)]
-    new, begin, visible = places.take(chosen), FIRST_SHARE * light[chosen].float(), model.visible
+    new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
+    hiders, own = model.hiders, model.opacity().detach()[kept]
+    together = torch.cat([albedo, begin])
     model.place(
         torch.cat([present.centre, new.centre]),
         torch.cat([present.normal, new.normal]),
-        torch.cat([albedo, begin]),
+        together,
+        torch.cat([own, unknown_opacity(together)[len(own) :]]),
     )
-    if len(visible):  # until it is worked out anew
-        model.visible = torch.cat([visible[:, kept], visible.new_ones(len(visible), len(chosen))], 1)
+    if len(hiders):  # until it is worked out anew
+        number = torch.cat([kept.new_zeros(1), kept]).cumsum(0) * torch.cat([kept.new_ones(1), kept])
+        stay = number.to(torch.int32)[hiders[:, :, kept]]
+        model.hiders = torch.cat([stay, stay.new_zeros(*stay.shape[:2], len(chosen), stay.shape[3])], 2)
     return len(chosen)

@@ -29,7 +29,7 @@ from nlos_lit.effects.strengths import effects_at, report
 from nlos_lit.functional.surfel_paths import SPLINE_VARIANCE, quadrature, spread
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.runtime.memory import check_machine
-from nlos_lit.surfels.model import SHARE, Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 log = logging.getLogger(__name__)
 
@@ -176,7 +176,9 @@ def truth_surfels(
         laser_sensor=spline_sensor(capture, _response(sensor, capture.bin_length, intensity)),
         quadrature=1,
     )
-    model.visible = torch.from_numpy(visible[:, lit]).to(SHARE)
+    # Who looks at a patch's other side is kept from it as if by the first patch.
+    model.hiders = torch.from_numpy(~visible[:, lit]).to(torch.int32)[None, :, :, None]
+    model.set_opacity(torch.ones(len(model)))
     return model
 
 

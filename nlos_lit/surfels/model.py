@@ -32,14 +32,15 @@ from nlos_lit.functional.surfel_paths import (
     spread,
     trace,
 )
-from nlos_lit.functional.surfel_visibility import clear_view
+from nlos_lit.functional.surfel_visibility import who_hides
 from nlos_lit.io.points import Points
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
 
-OPAQUE = (0.6, 0.2, 0.05)  # of the mean albedo: surfels that are fainter than one of these hide nothing
-LOOKED = 2  # points along each side of a surfel at which it is looked whether it is in view
-SHARE = torch.float16  # quarters are exact
+UNKNOWN = 0.5  # opacity of a surfel of which the counts have said nothing yet …
+WHOLE = 0.6  # … from this share of the mean albedo on; of fainter ones in proportion, since they may be false
+CLEAR = 0.1  # opacity below which a surfel is not drawn: it would stand before what does hide
+LOOKED = 2  # points along each side of a surfel at which it is looked who hides it
 
 
 class Lateral(NamedTuple):
@@ -66,13 +67,15 @@ class SurfelModel(nn.Module):
         laser_sensor: from :func:`spline_sensor`.
         quadrature: points along each side of a surfel.
 
-    What stands in front hides all, until :meth:`set_passing`.
+    What stands in front hides a share of what is behind, its ``opacity``: outlines are known to a cell only,
+    dark surfels hide, and false ones do not.
 
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
-        visible: ``[S, M]`` share of each surfel that each spot sees; ``[0, M]`` where all see all.
-        opaque: share of the mean albedo below which surfels hide nothing.
+        hiders: ``[1 or 2, S, M, K]`` which surfel hides each of K points of every surfel from each spot's
+            laser (and sensor, unless confocal), counted from 1; 0 where none does. ``[0, 0, 0, 0]`` where
+            nothing is hidden.
         observed: ``[S, T]`` which bins were recorded; ``[0, T]`` where all were.
         pairs: neighbours on one sheet, see :meth:`link`.
         sheet: how normals follow from places, between :meth:`lay` and :meth:`lift`; None otherwise.
@@ -85,7 +88,7 @@ class SurfelModel(nn.Module):
     cell: Tensor
     anchor: Tensor
     direction: Tensor
-    visible: Tensor
+    hiders: Tensor
     observed: Tensor
     pairs: tuple[Tensor, Tensor]
     sheet: Sheet | None
@@ -117,17 +120,18 @@ class SurfelModel(nn.Module):
         self.register_buffer("observed", torch.from_numpy(seen), persistent=False)
         cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
         self.register_buffer("cell", cell, persistent=False)
-        self.raw_passing = nn.Parameter(torch.tensor(-math.inf))
-        self.opaque = OPAQUE[0]
         self.place(centre, normal, albedo)
 
-    def place(self, centre: Tensor, normal: Tensor, albedo: Tensor) -> None:
-        """Replace all surfels; they see every spot until :meth:`update_visibility`.
+    def place(
+        self, centre: Tensor, normal: Tensor, albedo: Tensor, opacity: Tensor | None = None
+    ) -> None:
+        """Replace all surfels; nothing is hidden until :meth:`update_hiders`.
 
         Args:
             centre: ``[M, 3]`` m.
             normal: ``[M, 3]`` of any length, towards the wall's side.
             albedo: ``[M]`` > 0.
+            opacity: ``[M]``; None takes :func:`unknown_opacity`.
         """
         device = self.laser.device
         normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
@@ -136,7 +140,7 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
-        self.register_buffer("visible", torch.ones(0, len(centre), dtype=SHARE, device=device))
+        self.register_buffer("hiders", torch.zeros(0, 0, 0, 0, dtype=torch.int32, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
         self.raw_shift = nn.Parameter(torch.zeros(len(centre), device=device))  # neighbours come along
@@ -144,14 +148,15 @@ class SurfelModel(nn.Module):
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
         )
+        opacity = unknown_opacity(albedo) if opacity is None else opacity
+        self.raw_opacity = nn.Parameter(torch.logit(opacity.to(device=device, dtype=torch.float32)))
         self.sheet = None
         self.link()
 
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
-        """Leave out all surfels but those of ``which`` ``[M]`` bool; they see every spot, as after place."""
-        centre, normal = self.placed()
-        self.place(centre[which], normal[which], self.albedo()[which])
+        """Leave out all surfels but those of ``which`` ``[M]`` bool; nothing is hidden, as after place."""
+        self.place(*(part[which] for part in (*self.placed(), self.albedo(), self.opacity())))
 
     @torch.no_grad()
     def divide(self, parts: int) -> None:
@@ -163,7 +168,8 @@ class SurfelModel(nn.Module):
         x, y = (o - (parts - 1) / 2 * p for o, p in zip(self.lateral.origin, finer, strict=True))
         nx, ny = self.lateral.shape
         self.lateral, self.cell = Lateral((x, y), finer, (nx * parts, ny * parts)), self.cell / parts
-        self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in (normal, self.albedo())))
+        same = (normal, self.albedo(), self.opacity())
+        self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in same))
 
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
@@ -246,73 +252,77 @@ class SurfelModel(nn.Module):
         level, albedo = level_of(own), own if albedo is None else albedo
         return evenness * albedo_steps(albedo, self.pairs, level) + bright * brightness(albedo, level)
 
+    def opacity(self) -> Tensor:
+        """``[M]`` share of the light that a surfel keeps from what is behind it."""
+        return torch.sigmoid(self.raw_opacity)
+
     @torch.no_grad()
-    def update_visibility(self, spots: Tensor | None = None) -> None:
-        """Find what each spot sees of each surfel, at ``LOOKED`` × ``LOOKED`` points: see :meth:`sees`.
+    def set_opacity(self, opacity: Tensor) -> None:
+        """Store opacities ``[M]``, in place; a fit leaves 0 and 1 as they are."""
+        self.raw_opacity.copy_(torch.logit(opacity))
+
+    @torch.no_grad()
+    def update_hiders(self, spots: Tensor | None = None) -> None:
+        """Find who hides each surfel, at ``LOOKED`` × ``LOOKED`` points of it: see :meth:`hidden_by`.
 
         Args:
             spots: ``[B]`` rows of the capture; the others see all. None finds it for every spot.
         """
         rows = torch.arange(len(self.laser), device=self.laser.device) if spots is None else spots
-        self.visible = torch.ones(len(self.laser), len(self), dtype=SHARE, device=self.laser.device)
-        self.visible[rows] = self.sees(rows, self.points_of(*self.placed()))
+        found = self.hidden_by(rows, self.points_of(*self.placed()))
+        self.hiders = found.new_zeros(len(found), len(self.laser), *found.shape[2:])
+        self.hiders[:, rows] = found
 
     def points_of(self, centre: Tensor, normal: Tensor) -> Tensor:
-        """``[V, K, 3]`` points of surfels at which it is looked whether they are in view."""
+        """``[V, K, 3]`` points of surfels at which it is looked who hides them."""
         shift, _ = spread(normal, self.cell, quadrature(LOOKED, self.cell.device))
         return centre[:, None] + shift
 
     @torch.no_grad()
-    def sees(self, spots: Tensor, places: Tensor) -> Tensor:
-        """What the surfels leave in view of laser and sensor; those below ``opaque`` hide nothing.
+    def hidden_by(self, spots: Tensor, places: Tensor) -> Tensor:
+        """Which surfels hide places from laser and sensor; those below an opacity of ``CLEAR`` hide nothing.
 
         Args:
             spots: ``[B]`` rows of the capture.
             places: ``[V, K, 3]`` m, K points of each place.
 
         Returns:
-            ``[B, V]`` share of the points that both see.
+            ``[1 or 2, B, V, K]`` int32, as ``hiders``.
         """
-        albedo, (centre, normal) = self.albedo(), self.placed()
-        solid = albedo > self.opaque * albedo.mean()
+        centre, normal = self.placed()
+        drawn = torch.nonzero(self.opacity() > CLEAR)[:, 0]
+        number = torch.cat([drawn.new_zeros(1), drawn + 1]).to(torch.int32)
 
-        def seen(wall: Tensor) -> Tensor:
+        def found(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
-            return clear_view(centre[solid], normal[solid], self.cell, points, places)[row]
+            by = who_hides(centre[drawn], normal[drawn], self.cell, points, places)
+            return number[by + 1][row]
 
-        clear = seen(self.laser[spots])
-        return (clear if self.confocal else clear & seen(self.sensor[spots])).to(SHARE).mean(2)
+        legs = [self.laser] if self.confocal else [self.laser, self.sensor]
+        return torch.stack([found(wall[spots]) for wall in legs])
+
+    def arriving(self, hiders: Tensor) -> Tensor:
+        """Share of the light of some places that is not hidden.
+
+        Args:
+            hiders: ``[1 or 2, B, V, K]`` of their points.
+
+        Returns:
+            ``[B, V]`` mean over the points, differentiable in the opacities.
+        """
+        passes = torch.cat([self.raw_opacity.new_ones(1), 1 - self.opacity()])
+        legs = [passes.index_select(0, leg.reshape(-1)).view(leg.shape) for leg in hiders]
+        return math.prod(legs[1:], start=legs[0]).mean(2)
 
     def paths(self, spots: Tensor) -> Paths:
         """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
         paths = trace(*self.placed(), self.cell, offsets, *walls, self.confocal)
-        if len(self.visible):
-            paths = paths._replace(
-                contribution=paths.contribution * self.arriving(self.visible[spots])[:, :, None]
-            )
+        if len(self.hiders):
+            seen = self.arriving(self.hiders[:, spots])
+            paths = paths._replace(contribution=paths.contribution * seen[:, :, None])
         return paths
-
-    def passing(self) -> Tensor:
-        """Share of the light that passes the sheets in front, whose outlines are known to a cell only."""
-        return torch.sigmoid(self.raw_passing)
-
-    @torch.no_grad()
-    def set_passing(self, share: float) -> None:
-        """Store the share that passes, from 0 to 1, in place; a fit leaves 0 and 1 as they are."""
-        self.raw_passing.copy_(torch.logit(torch.tensor(share)))
-
-    def arriving(self, visible: Tensor) -> Tensor:
-        """Share of the light that arrives: all where the view is clear, :meth:`passing` where it is not.
-
-        Args:
-            visible: ``[B, V]`` share that is in view.
-
-        Returns:
-            ``[B, V]``.
-        """
-        return torch.lerp(self.passing(), self.raw_passing.new_ones(()), visible.to(self.raw_passing))
 
     def arrival(self, length: Tensor) -> Tensor:
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""
@@ -447,11 +457,11 @@ class SurfelModel(nn.Module):
 
     def get_extra_state(self) -> dict[str, Any]:
         response = {name: (p.lower, p.upper, p.unit) for name, p in self.laser_sensor.named_children()}
-        own = {"quadrature": self.quadrature, "opaque": self.opaque, "lateral": tuple(self.lateral)}
+        own = {"quadrature": self.quadrature, "lateral": tuple(self.lateral)}
         return {"response": response, **own}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        self.quadrature, self.opaque = state["quadrature"], state["opaque"]
+        self.quadrature = state["quadrature"]
 
     @classmethod
     def from_state(cls, capture: Capture, state: dict[str, Any]) -> SurfelModel:
@@ -481,7 +491,7 @@ class SurfelModel(nn.Module):
             lateral=lateral,
             laser_sensor=sensor,
         )
-        model.visible = torch.empty_like(state["visible"])
+        model.hiders = torch.empty_like(state["hiders"])
         model.load_state_dict(state)
         model.link()
         return model
@@ -514,6 +524,22 @@ def spline_sensor(capture: Capture, parameters: dict[str, BoundedParameter]) -> 
 def inverse_softplus(value: Tensor) -> Tensor:
     """x with softplus(x) = value > 0."""
     return value + torch.log(-torch.expm1(-value))
+
+
+def unknown_opacity(albedo: Tensor) -> Tensor:
+    """What surfels are taken to hide until the counts say more.
+
+    Args:
+        albedo: ``[M]``.
+
+    Returns:
+        ``[M]`` between 0 and 1.
+
+    Examples:
+        >>> unknown_opacity(torch.tensor([0.15, 1.0, 1.85]))
+        tensor([0.1250, 0.5000, 0.5000])
+    """
+    return UNKNOWN * (albedo / (WHOLE * albedo.mean()).clamp_min(1e-30)).clamp(0.02, 1.0)
 
 
 def points_along(cell: float, bin_length: float) -> int:

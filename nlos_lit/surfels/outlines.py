@@ -18,7 +18,7 @@ from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import ring
 from nlos_lit.surfels.growth import within_depths
-from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.model import SurfelModel, unknown_opacity
 
 RINGS = 2  # cells by which sheets are extended at a time
 SOURCE = 0.1  # of the mean albedo: fainter surfels are not extended
@@ -48,14 +48,15 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         centre, normal, albedo = (
             torch.cat([old, new[inside]]) for old, new in zip((centre, normal, albedo), more, strict=True)
         )
-    visible = model.visible
-    if len(visible):
-        seen = visible.new_ones(len(visible), len(centre) - present)
-        seen[spots] = model.sees(spots, model.points_of(centre[present:], normal[present:]))
-        visible = torch.cat([visible, seen], 1)
-    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]))
-    if len(visible):
-        model.visible = visible
+    hiders = model.hiders
+    if len(hiders):
+        more = hiders.new_zeros(*hiders.shape[:2], len(centre) - present, hiders.shape[3])
+        more[:, spots] = model.hidden_by(spots, model.points_of(centre[present:], normal[present:]))
+        hiders = torch.cat([hiders, more], 2)
+    opacity = torch.cat([model.opacity(), own.new_zeros(len(centre) - present)])
+    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity)
+    if len(hiders):
+        model.hiders = hiders
 
 
 def solve_albedos(
@@ -126,4 +127,8 @@ def cut_back(model: SurfelModel, before: Tensor) -> None:
     albedo = model.albedo()
     kept = albedo > DIM * level_of(albedo)
     kept[: len(before)] |= before > DIM * level_of(before)
+    number = int(kept[: len(before)].sum())
     model.keep(kept)
+    opacity = model.opacity().detach()
+    opacity[number:] = unknown_opacity(model.albedo().detach())[number:]
+    model.set_opacity(opacity)

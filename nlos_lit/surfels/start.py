@@ -105,7 +105,6 @@ def seed_surfels(
         lateral=lateral,
         laser_sensor=sensor,
     )
-    model.set_passing(0.5)
     widest = float(model.cell.max()) / capture.bin_length  # bins
     parts = s.subdivide or math.ceil(widest / WIDEST)
     points = s.quadrature or points_along(float(model.cell.max()) / parts, capture.bin_length)

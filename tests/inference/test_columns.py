@@ -105,7 +105,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
             changes.append(lambda mo, ex, h, k=k, a=axis: mo.anchor[k, a].add_(h * mo.bin_length / 2))
     for name in ("sigma_ls", "kappa_s", "intensity", "background"):
         changes.append(lambda mo, ex, h, n=name: getattr(mo.laser_sensor, n).raw.add_(h))
-    changes.append(lambda mo, ex, h: mo.raw_passing.add_(h))
+    changes.append(lambda mo, ex, h: mo.raw_opacity.add_(h))
     for k, effect in enumerate(extension.effects):
         for p in effect.declared:
             changes.append(lambda mo, ex, h, k=k, p=p: getattr(ex.effects[k], f"raw_{p}").add_(h))

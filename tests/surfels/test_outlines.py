@@ -108,16 +108,17 @@ def test_rings_lie_within_the_grid_hide_nothing_and_are_hidden():
     model = board(torch.ones(3, 3))
     front = torch.tensor([[0.0, 0.0, 0.4]])
     both = torch.cat([model.centre(), front]), torch.tensor([0.0, 0.0, -1.0]).expand(10, 3)
-    model.place(*both, torch.cat([torch.ones(9), torch.tensor([0.9])]))
-    model.opaque = 0.6
-    model.update_visibility()
-    before = model.visible.clone()
+    model.place(*both, torch.cat([torch.ones(9), torch.tensor([0.9])]), torch.full((10,), 0.8))
+    model.update_hiders()
+    before = model.hiders.clone()
     extend(model, DEEP, SPOTS)
-    assert torch.equal(model.visible[:, :10], before)
+    assert torch.equal(model.hiders[:, :, :10], before)
+    assert torch.allclose(model.opacity(), torch.tensor([0.8] * 10 + [0.0] * (len(model) - 10)))
     back = model.centre()[:, 2] > 0.6
     assert int(back.sum()) == (3 + 2 * RINGS) ** 2
-    assert not model.visible[:, 10:][:, back[10:]].all()  # the one in front hides some
-    assert model.visible[:, ~back].all()  # and nothing hides what lies beside it
+    new = model.hiders[:, :, 10:][:, :, back[10:]]
+    assert set(new.unique().tolist()) == {0, 10}  # the one in front, counted from 1, hides some
+    assert not model.hiders[:, :, ~back].any()  # and nothing hides what lies beside it
     shallow = VolumeGrid((-1.0, -1.0, 0.55), (0.1, 0.1, 0.02), (20, 20, 20))
     model = board(torch.ones(3, 3), z=0.45)
     extend(model, shallow, SPOTS)
@@ -143,8 +144,13 @@ def test_surfels_go_that_are_dim_and_were_dim_or_new(before, share, stays):
     model = board(albedo)
     assert level_of(model.albedo()).item() == pytest.approx(1.0, rel=1e-5)
     known = torch.ones(8) if before is None else torch.tensor([1.0] * 8 + [before * DIM])
+    model.set_opacity(torch.full((9,), 0.8))
     cut_back(model, known)
     assert len(model) == (9 if stays else 8)
+    # Those that were there keep their opacity, of a new one nothing is known.
+    new = 9 if before is None and stays else 8
+    assert torch.allclose(model.opacity()[:8], torch.tensor(0.8))
+    assert len(model) == 8 or (model.opacity()[8] < 0.1) == (new == 9)
 
 
 def outlined(number: int) -> SurfelFit:

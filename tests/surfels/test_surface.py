@@ -45,7 +45,7 @@ from nlos_lit.surfels.growth import (
     prune_and_grow,
     support,
 )
-from nlos_lit.surfels.model import OPAQUE, SurfelModel
+from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.outlines import SEARCH, solve_albedos
 
 QUICK = SurfelSettings(contest=40, rounds=2, outlines=1, more=0, test_spots=200, floor=0.15, per_cell=2)
@@ -232,14 +232,17 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
     tail.set("fraction", 0.25)
     tail.set("decay", 25 * BIN)
     expected = model.expected(spots, Extension([tail]))
-    counts = torch.poisson(expected, generator=torch.Generator().manual_seed(0))
-    found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
-    choose_shapes(model, found, spots, counts)
-    fitted_tail, wall, leak = found.effects
-    assert fitted_tail.value("decay").item() == pytest.approx(25 * BIN)
-    assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
-    assert leak.value("amplitude").item() < 0.02
-    assert wall.value("gain_map").abs().max() == 0
+    leaks = []
+    for seed in range(3):
+        counts = torch.poisson(expected, generator=torch.Generator().manual_seed(seed))
+        found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
+        choose_shapes(model, found, spots, counts)
+        fitted_tail, wall, leak = found.effects
+        assert fitted_tail.value("decay").item() == pytest.approx(25 * BIN)
+        assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
+        assert wall.value("gain_map").abs().max() == 0
+        leaks.append(leak.value("amplitude").item())
+    assert np.mean(leaks) < 0.02  # noise alone gives one 0.01
 
 
 def test_what_is_asked_of_a_path_is_what_leaving_it_out_gains(fitted):
@@ -366,11 +369,11 @@ def test_a_body_that_is_missing_is_found(fitted):
     reach = torch.tensor([0.175, 0.15, 0.0]) + float(model.cell.max())
     inside, albedo = (away.abs() < reach).all(1), model.albedo().detach()[len(front) :]
     assert float(albedo[inside].sum() / albedo.sum()) > 0.8
-    model.update_visibility()
-    before = model.visible.clone()
+    model.update_hiders()
+    before = model.hiders.clone()
     nothing = PlaceTest(model, capture, train, counts, counts.clamp_min(0.1))
     assert begin_bodies(model, grid, nothing, reserve) == 0
-    assert torch.equal(model.visible, before), "it stays as it was"
+    assert torch.equal(model.hiders, before), "it stays as it was"
 
 
 @pytest.mark.parametrize(("lit", "found"), [("everywhere", True), ("in a corner", False)])
@@ -575,10 +578,10 @@ def test_what_goes_on_begins_where_it_ended(fitted):
     capture, held, grid, result = fitted[0], fitted[1], fitted[3], fitted[-1]
     train = torch.from_numpy(np.flatnonzero(~held))
     counts = torch.from_numpy(capture.gated_counts())[train]
-    rates = dict.fromkeys(("depth_rate", "albedo_rate", "response_rate"), 1e-9)
+    rates = dict.fromkeys(("depth_rate", "albedo_rate", "opacity_rate", "response_rate"), 1e-9)
     settings, nothing = dataclasses.replace(QUICK, **rates), Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
     model = SurfelModel.from_state(capture, result.model.state_dict())
-    model.update_visibility()
+    model.update_hiders()
     generator = torch.Generator().manual_seed(0)
     given = (model, capture, grid, counts, train, settings, nothing, Extension([]), generator)
     fit = SurfelFit(*given, torch.arange(len(train)), torch.arange(0))
@@ -599,11 +602,11 @@ def test_division_keeps_plane_area_and_albedo(fitted):
     model = SurfelModel.from_state(capture, result.model.state_dict())
     before, spots = model.expected(torch.arange(20)), torch.arange(20)
     number, quadrature = len(model), model.quadrature
-    visible = model.visible
-    model.quadrature = 2 * quadrature
+    hiders, model.quadrature = model.hiders, 2 * quadrature
     fine = model.expected(spots)
     model.divide(2)
-    model.quadrature, model.visible = quadrature, visible.repeat_interleave(4, 1)
+    first_part = torch.where(hiders > 0, 4 * (hiders - 1) + 1, 0)  # of the four that a surfel becomes
+    model.quadrature, model.hiders = quadrature, first_part.repeat_interleave(4, 2)
     assert len(model) == 4 * number
     flat = -result.model.normal()[:, 2] > 0.9
     assert flat.all() or flat.float().mean() > 0.5
@@ -658,16 +661,21 @@ def test_memory_is_that_of_a_step_or_of_the_paths_that_are_kept(fitted, monkeypa
     assert asked == [len(fit.model) * kept + 8 * fit.counts.numel()]
 
 
-@pytest.mark.parametrize("dark", [True, False])
-def test_the_counts_say_whether_faint_surfels_hide(fitted, dark):
+@pytest.mark.parametrize("opacity", [0.02, 0.98])
+def test_the_counts_say_how_much_dark_surfels_hide(fitted, opacity):
     fit = fitted[-1].fit.copy(Extension([]), 0)
     model = fit.model
     front = model.centre()[:, 2] < 0.62
     model.set_albedo(torch.where(front, 0.1, 1.0).to(front.device))
-    model.set_passing(0.0)
-    model.opaque = OPAQUE[-1] if dark else OPAQUE[0]
-    model.update_visibility()
-    assert model.visible.all() != dark
+    model.update_hiders()
+    hiding = torch.bincount(model.hiders.flatten().long(), minlength=len(model) + 1)[1:]
+    assert front[hiding > 0].all()
+    model.set_opacity(torch.full((len(model),), opacity))
     fit.counts = model.expected(fit.train)
-    fit._hide()
-    assert model.opaque == (OPAQUE[-1] if dark else OPAQUE[0])
+    model.set_opacity(torch.full((len(model),), 0.5))
+    fit.schedule([Round(60, onward=True)])
+    fit.finish()
+    found = fit.model.opacity()[hiding > 0.5 * hiding.max()]
+    assert len(found) > 3
+    assert (found - opacity).abs().max() < 0.25
+    assert torch.allclose(fit.model.opacity()[hiding == 0], torch.tensor(0.5))  # they say nothing of others

@@ -24,7 +24,7 @@ from nlos_lit.functional.surfel_graph import (
 )
 from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.model import OPAQUE, Lateral, SurfelModel, spline_sensor
+from nlos_lit.surfels.model import CLEAR, Lateral, SurfelModel, spline_sensor, unknown_opacity
 
 CELL = 0.05
 FACING = [0.0, 0.0, -1.0]
@@ -256,51 +256,60 @@ def test_an_edge_of_albedo_costs_little_more_the_higher_it_is():
     assert cost[3:] == pytest.approx(EDGE * np.log1p(size / EDGE), rel=1e-4)  # … and a logarithm above EDGE
 
 
-@pytest.mark.parametrize("opaque", OPAQUE)
 @pytest.mark.parametrize(("share", "hides"), [(0.95, False), (1.05, True)])
-def test_faint_surfels_hide_nothing(opaque, share, hides):
+def test_surfels_that_are_next_to_clear_hide_nothing(share, hides):
+    """They would stand before what does hide: here the one in the middle, behind the first."""
     capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
-    others = [[x, 0.5, 0.5] for x in (-0.4, 0.4)]
-    # Its own albedo is part of the mean, too: a = share · opaque · (3 + a)/4.
-    albedo = 3 * share * opaque / (4 - share * opaque)
-    model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], *others], albedo=[albedo, 1.0, 1.0, 1.0])
-    model.opaque = opaque
-    model.update_visibility()
-    assert model.visible.tolist() == [[1.0, float(not hides), 1.0, 1.0]]
+    model = build(capture, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.7], [0.0, 0.0, 1.0]])
+    model.set_opacity(torch.tensor([share * CLEAR, 0.8, 0.5]))
+    model.update_hiders()
+    assert model.hiders.tolist() == [[[[0] * 4, [int(hides)] * 4, [1 if hides else 2] * 4]]]
+    seen = 1 - share * CLEAR if hides else 1 - 0.8
+    assert model.arriving(model.hiders)[0, 2].item() == pytest.approx(seen)
 
 
-def test_a_surfel_is_seen_in_part_past_an_edge():
+def test_a_surfel_is_hidden_in_part_past_an_edge():
     capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0], [0.5, 0.0, 0.5]])
-    cell = float(model.cell[0])
+    cell, facing = float(model.cell[0]), model.normal().detach()
     # The one in front ends at half a cell, so that a cell's width is hidden twice as far away.
-    for aside, share in ((0.0, 0.0), (1.0, 0.5), (2.0, 1.0)):
+    for aside, part in ((0.0, 1.0), (1.0, 0.5), (2.0, 0.0)):
         centre = torch.tensor([[0.0, 0.0, 0.5], [aside * cell, 0.0, 1.0], [0.5, 0.0, 0.5]])
-        model.place(centre, model.normal().detach(), torch.ones(3))
-        model.update_visibility()
-        assert model.visible.tolist() == [[1.0, share, 1.0]]
-        dark = model.laser_sensor.background().item()
-        seen, spots = model.render(torch.tensor([0])) - dark, torch.tensor([0])
-        model.visible = torch.ones_like(model.visible)
-        model.set_albedo(torch.tensor([1.0, share, 1.0]))
-        assert torch.allclose(seen, model.render(spots) - dark, rtol=1e-4, atol=1e-5)
-        model.set_albedo(torch.ones(3))
+        model.place(centre, facing, torch.ones(3), torch.full((3,), 0.8))
+        model.update_hiders()
+        assert model.arriving(model.hiders).tolist() == [pytest.approx([1.0, 1 - 0.8 * part, 1.0])]
 
 
-def test_a_share_passes_what_stands_in_front():
-    model, spots = random_model()
-    open_view = model.render(spots)
-    model.visible = torch.zeros(len(model.laser), len(model))
-    dark = model.render(spots)
-    assert torch.allclose(dark, model.laser_sensor.background().expand_as(dark), atol=1e-6)
-    model.set_passing(0.25)
-    assert torch.allclose(model.render(spots), dark + 0.25 * (open_view - dark), rtol=1e-4)
-    torch.autograd.grad(model.render(spots).sum(), model.raw_passing)
+def test_light_is_hidden_from_laser_and_from_sensor():
+    capture = wall([[-0.5, 0.0, 0.0]], [[0.5, 0.0, 0.0]])
+    front = [[-0.25, 0.0, 0.5], [0.25, 0.0, 0.5], [-0.35, 0.0, 0.7]]
+    model = build(capture, [*front, [0.0, 0.0, 1.0]])
+    model.set_opacity(torch.tensor([0.8, 0.5, 0.9, 0.5]))
+    model.update_hiders()
+    # The third is on its way from the laser to none; of the last both legs are crossed.
+    assert model.hiders[:, 0, 3].tolist() == [[1] * 4, [2] * 4]
+    assert model.arriving(model.hiders)[0, 3].item() == pytest.approx(0.2 * 0.5)
+    opacity = model.raw_opacity
+    (slope,) = torch.autograd.grad(model.render(torch.tensor([0])).sum(), opacity)
+    assert (slope[:2] < 0).all()
+    assert slope[3] == 0
+
+
+def test_surfels_keep_their_opacity_and_new_ones_have_an_unknown_one():
+    model, _ = random_model()
+    own = torch.linspace(0.2, 0.8, 7)
+    model.set_opacity(own)
+    model.keep(torch.tensor([True, False, True, True, False, True, True]))
+    assert torch.allclose(model.opacity(), own[[0, 2, 3, 5, 6]])
+    model.divide(2)
+    assert torch.allclose(model.opacity(), own[[0, 2, 3, 5, 6]].repeat_interleave(4))
+    model.place(*(v.detach() for v in (*model.placed(), model.albedo())))
+    assert torch.allclose(model.opacity(), unknown_opacity(model.albedo().detach()))
 
 
 def test_state_restores_the_model():
     model, spots = random_model()
-    model.update_visibility()
+    model.update_hiders()
     again = SurfelModel.from_state(_capture_of(model), model.state_dict())
     assert torch.equal(again.render(spots), model.render(spots))
     assert len(again) == 7
