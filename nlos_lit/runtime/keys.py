@@ -140,6 +140,7 @@ SURFELS: dict[str, Rule] = {
     "batch": whole(1, 1_000_000, "spots"),
     "depth_rate": number(0, 100, "bins"),
     "albedo_rate": _rate,
+    "opacity_rate": _rate,
     "response_rate": _rate,
     "effect_rate": _rate,
     "bending": _weight,

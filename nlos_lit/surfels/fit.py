@@ -456,7 +456,7 @@ class SurfelFit:
         widest = float(self.model.cell.max())
         points = s.quadrature or points_along(widest, self.model.bin_length)
         self.model.quadrature = 1 if now.contest else points
-        if now.settling:
+        if now.settling or now.grow:  # surfels come and go: what they were taken to hide says little
             self.model.set_opacity(unknown_opacity(self.model.albedo().detach()))
         self._hide(now.outline)
         if now.outline:

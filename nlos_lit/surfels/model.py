@@ -274,7 +274,15 @@ class SurfelModel(nn.Module):
         self.hiders[:, rows] = found
 
     def points_of(self, centre: Tensor, normal: Tensor) -> Tensor:
-        """``[V, K, 3]`` points of surfels at which it is looked who hides them."""
+        """Points of surfels at which it is looked who hides them.
+
+        Args:
+            centre: ``[V, 3]`` m.
+            normal: ``[V, 3]`` unit.
+
+        Returns:
+            ``[V, K, 3]`` m.
+        """
         shift, _ = spread(normal, self.cell, quadrature(LOOKED, self.cell.device))
         return centre[:, None] + shift
 
