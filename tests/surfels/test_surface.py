@@ -45,7 +45,7 @@ from nlos_lit.surfels.growth import (
     prune_and_grow,
     support,
 )
-from nlos_lit.surfels.model import SurfelModel
+from nlos_lit.surfels.model import SurfelModel, unknown_opacity
 from nlos_lit.surfels.outlines import SEARCH, solve_albedos
 
 QUICK = SurfelSettings(contest=40, rounds=2, outlines=1, more=0, test_spots=200, floor=0.15, per_cell=2)
@@ -345,6 +345,25 @@ def test_surfels_in_empty_space_die_and_missing_ones_grow(fitted):
     now = model.centre().detach()
     assert torch.cdist(ghosts, now).min() > 0.02
     assert ((now[:, :2] - torch.tensor([0.12, 0.08])).norm(dim=1) < 0.06).sum() >= 2
+
+
+def test_who_hides_whom_is_remembered_when_surfels_come_and_go(fitted):
+    model = SurfelModel.from_state(fitted[0], fitted[-1].model.state_dict())
+    model.update_hiders()
+    before, centre, opacity = model.hiders, model.centre().detach(), model.opacity().detach()
+    kept = torch.rand(len(model), generator=torch.Generator().manual_seed(0)) > 0.3
+    place = Seeds(torch.tensor([[0.5, 0.5, 0.9]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    growth._add(model, kept, place, torch.ones(1), torch.ones(1), 0.1)
+    number = int(kept.sum())
+    assert len(model) == number + 1
+    assert torch.allclose(model.opacity()[:number], opacity[kept])
+    assert torch.allclose(model.opacity()[number:], unknown_opacity(model.albedo().detach())[number:])
+    assert not model.hiders[:, :, number].any()  # of the new one nothing is known
+    who, was = model.hiders[:, :, :number].long(), before[:, :, kept].long()
+    stays = torch.cat([torch.tensor([False]), kept])[was]
+    assert stays.any() and (was > 0).sum() > stays.sum()
+    assert torch.equal(who > 0, stays)
+    assert torch.equal(model.centre()[who[stays] - 1], centre[was[stays] - 1])
 
 
 def without_the_back(fitted) -> tuple[SurfelModel, torch.Tensor, torch.Tensor]:
