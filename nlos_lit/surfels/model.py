@@ -122,9 +122,7 @@ class SurfelModel(nn.Module):
         self.register_buffer("cell", cell, persistent=False)
         self.place(centre, normal, albedo)
 
-    def place(
-        self, centre: Tensor, normal: Tensor, albedo: Tensor, opacity: Tensor | None = None
-    ) -> None:
+    def place(self, centre: Tensor, normal: Tensor, albedo: Tensor, opacity: Tensor | None = None) -> None:
         """Replace all surfels; nothing is hidden until :meth:`update_hiders`.
 
         Args:

@@ -50,9 +50,9 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         )
     hiders = model.hiders
     if len(hiders):
-        more = hiders.new_zeros(*hiders.shape[:2], len(centre) - present, hiders.shape[3])
-        more[:, spots] = model.hidden_by(spots, model.points_of(centre[present:], normal[present:]))
-        hiders = torch.cat([hiders, more], 2)
+        new = hiders.new_zeros(*hiders.shape[:2], len(centre) - present, hiders.shape[3])
+        new[:, spots] = model.hidden_by(spots, model.points_of(centre[present:], normal[present:]))
+        hiders = torch.cat([hiders, new], 2)
     opacity = torch.cat([model.opacity(), own.new_zeros(len(centre) - present)])
     model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity)
     if len(hiders):

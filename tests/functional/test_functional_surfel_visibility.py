@@ -107,7 +107,8 @@ def test_the_front_of_a_sphere_hides_its_back_and_not_itself():
     # Two cells and more behind its outline, and where the way in leads through the patches.
     inside = (towards * (back - middle)).sum(2) < -0.13
     assert inside.float().mean() > 0.5
-    assert clear_view(front, normal, cell, wall, back[:, None])[..., 0][inside].float().mean() < 0.01  # holes between points
+    views = clear_view(front, normal, cell, wall, back[:, None])[..., 0]
+    assert views[inside].float().mean() < 0.01  # holes between points
 
 
 def test_errors_of_outlines_on_a_ring_before_a_board():

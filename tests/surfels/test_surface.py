@@ -361,7 +361,8 @@ def test_who_hides_whom_is_remembered_when_surfels_come_and_go(fitted):
     assert not model.hiders[:, :, number].any()  # of the new one nothing is known
     who, was = model.hiders[:, :, :number].long(), before[:, :, kept].long()
     stays = torch.cat([torch.tensor([False]), kept])[was]
-    assert stays.any() and (was > 0).sum() > stays.sum()
+    assert stays.any()
+    assert (was > 0).sum() > stays.sum()
     assert torch.equal(who > 0, stays)
     assert torch.equal(model.centre()[who[stays] - 1], centre[was[stays] - 1])
 
