@@ -100,7 +100,7 @@ def surfels(scene: Capture, number: int = 12, level: float = 1.0) -> SurfelModel
 
 
 def hide_some(model: SurfelModel) -> None:
-    """From each wall point a quarter of the surfels' points is hidden by others that pass some of the light."""
+    """From each wall point others hide a quarter of the surfels' points, but for some of the light."""
     gen, m = np.random.default_rng(8), len(model)
     shape = (1 if model.confocal else 2, len(model.laser), m, 4)
     hidden, by = gen.random(shape) > 0.75, gen.integers(1, m + 1, shape)

@@ -469,7 +469,7 @@ class SurfelFit:
             solve_albedos(self.model, spots, counts, *prior, MEND, self.extension)
 
     def _hide(self, tested_only: bool = False) -> None:
-        """Who hides whom; with ``tested_only`` for the tested spots, and the others see all until the next."""
+        """Who hides whom; with ``tested_only`` for the tested spots: the others see all until then."""
         if self.settings.visibility:
             self.model.update_hiders(self.train[self.tested] if tested_only else None)
 
