@@ -34,7 +34,7 @@ from nlos_lit.functional.surfel_paths import (
 )
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor, unknown_opacity
+from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 CHUNK = 1 << 21  # paths at a time
 BLOCKS = 6  # along each side of the wall, between which scores are held against each other
@@ -549,13 +549,12 @@ def _add(model: SurfelModel, kept: Tensor, places: Seeds, gain: Tensor, light: T
     # explain it otherwise.
     chosen = best_apart(places.centre, gain, apart)[: max(64, len(model) // 4)]
     new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
-    hiders, own = model.hiders, model.opacity().detach()[kept]
-    together = torch.cat([albedo, begin])
+    hiders, opacity = model.hiders, model.opacity()[kept]
     model.place(
         torch.cat([present.centre, new.centre]),
         torch.cat([present.normal, new.normal]),
-        together,
-        torch.cat([own, unknown_opacity(together)[len(own) :]]),
+        torch.cat([albedo, begin]),
+        opacity,
     )
     if len(hiders):  # until it is worked out anew
         number = torch.cat([kept.new_zeros(1), kept]).cumsum(0) * torch.cat([kept.new_ones(1), kept])

@@ -39,7 +39,7 @@ from nlos_lit.model.parameters import BoundedParameter
 
 UNKNOWN = 0.5  # opacity of a surfel of which the counts have said nothing yet …
 WHOLE = 0.6  # … from this share of the mean albedo on; of fainter ones in proportion, since they may be false
-CLEAR = 0.1  # opacity below which a surfel is not drawn: it would stand before what does hide
+HIDING = 0.1  # opacity below which a surfel is not drawn: it would stand before what does hide
 LOOKED = 2  # points along each side of a surfel at which it is looked who hides it
 
 
@@ -129,7 +129,7 @@ class SurfelModel(nn.Module):
             centre: ``[M, 3]`` m.
             normal: ``[M, 3]`` of any length, towards the wall's side.
             albedo: ``[M]`` > 0.
-            opacity: ``[M]``; None takes :func:`unknown_opacity`.
+            opacity: ``[N]`` of the first N; the others have an :func:`unknown_opacity`, all without any.
         """
         device = self.laser.device
         normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
@@ -146,7 +146,8 @@ class SurfelModel(nn.Module):
         self.raw_albedo = nn.Parameter(
             inverse_softplus(albedo.to(device=device, dtype=torch.float32).clamp_min(1e-7))
         )
-        opacity = unknown_opacity(albedo) if opacity is None else opacity
+        known = albedo[:0] if opacity is None else opacity
+        opacity = torch.cat([known, unknown_opacity(albedo)[len(known) :]])
         self.raw_opacity = nn.Parameter(torch.logit(opacity.to(device=device, dtype=torch.float32)))
         self.sheet = None
         self.link()
@@ -286,7 +287,7 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def hidden_by(self, spots: Tensor, places: Tensor) -> Tensor:
-        """Which surfels hide places from laser and sensor; those below an opacity of ``CLEAR`` hide nothing.
+        """Which surfels hide places from laser and sensor; those below an opacity of ``HIDING`` hide nothing.
 
         Args:
             spots: ``[B]`` rows of the capture.
@@ -296,7 +297,7 @@ class SurfelModel(nn.Module):
             ``[1 or 2, B, V, K]`` int32, as ``hiders``.
         """
         centre, normal = self.placed()
-        drawn = torch.nonzero(self.opacity() > CLEAR)[:, 0]
+        drawn = torch.nonzero(self.opacity() > HIDING)[:, 0]
         number = torch.cat([drawn.new_zeros(1), drawn + 1]).to(torch.int32)
 
         def found(wall: Tensor) -> Tensor:

@@ -18,7 +18,7 @@ from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import ring
 from nlos_lit.surfels.growth import within_depths
-from nlos_lit.surfels.model import SurfelModel, unknown_opacity
+from nlos_lit.surfels.model import SurfelModel
 
 RINGS = 2  # cells by which sheets are extended at a time
 SOURCE = 0.1  # of the mean albedo: fainter surfels are not extended
@@ -125,10 +125,8 @@ def cut_back(model: SurfelModel, before: Tensor) -> None:
         before: ``[N]`` albedos of the first N surfels, those that were there, before the others came.
     """
     albedo = model.albedo()
-    kept = albedo > DIM * level_of(albedo)
-    kept[: len(before)] |= before > DIM * level_of(before)
-    number = int(kept[: len(before)].sum())
-    model.keep(kept)
-    opacity = model.opacity().detach()
-    opacity[number:] = unknown_opacity(model.albedo().detach())[number:]
-    model.set_opacity(opacity)
+    kept, old = albedo > DIM * level_of(albedo), len(before)
+    kept[:old] |= before > DIM * level_of(before)
+    known = model.opacity()[:old][kept[:old]]
+    centre, normal = (part[kept] for part in model.placed())
+    model.place(centre, normal, albedo[kept], known)

@@ -24,7 +24,7 @@ from nlos_lit.functional.surfel_graph import (
 )
 from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
 from nlos_lit.model.parameters import BoundedParameter
-from nlos_lit.surfels.model import CLEAR, Lateral, SurfelModel, spline_sensor, unknown_opacity
+from nlos_lit.surfels.model import HIDING, Lateral, SurfelModel, spline_sensor, unknown_opacity
 
 CELL = 0.05
 FACING = [0.0, 0.0, -1.0]
@@ -261,10 +261,10 @@ def test_surfels_that_are_next_to_clear_hide_nothing(share, hides):
     """They would stand before what does hide: here the one in the middle, behind the first."""
     capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     model = build(capture, [[0.0, 0.0, 0.4], [0.0, 0.0, 0.7], [0.0, 0.0, 1.0]])
-    model.set_opacity(torch.tensor([share * CLEAR, 0.8, 0.5]))
+    model.set_opacity(torch.tensor([share * HIDING, 0.8, 0.5]))
     model.update_hiders()
     assert model.hiders.tolist() == [[[[0] * 4, [int(hides)] * 4, [1 if hides else 2] * 4]]]
-    seen = 1 - share * CLEAR if hides else 1 - 0.8
+    seen = 1 - share * HIDING if hides else 1 - 0.8
     assert model.arriving(model.hiders)[0, 2].item() == pytest.approx(seen)
 
 
