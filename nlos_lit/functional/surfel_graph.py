@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to exp(-1/2)
@@ -20,7 +21,7 @@ BRIGHT = 0.2  # deviation of ln(albedo) above that level
 
 
 def neighbour_pairs(
-    centre: Tensor, normal: Tensor, reach: float | Tensor, agree: float = 0.3, chunk: int = 1024
+    centre: Tensor, normal: Tensor, reach: float | Tensor, agree: float = 0.3
 ) -> tuple[Tensor, Tensor]:
     """Directed pairs (i, j) of surfels that are near each other and face alike.
 
@@ -29,10 +30,9 @@ def neighbour_pairs(
         normal: ``[M, 3]`` unit.
         reach: largest distance of a pair, m, or ``[M]`` for a reach of each first surfel.
         agree: least cosine between a pair's normals.
-        chunk: first surfels worked on at once, bounds the memory.
 
     Returns:
-        i and j ``[P]`` long, i ≠ j; ordered by i.
+        i and j ``[P]`` long, i ≠ j; ordered by i, then by j.
 
     Examples:
         >>> import torch
@@ -41,17 +41,18 @@ def neighbour_pairs(
         >>> neighbour_pairs(centre, normal, reach=0.2)
         (tensor([0, 1]), tensor([1, 0]))
     """
-    first, second = [], []
     reaches = torch.as_tensor(reach, device=centre.device).expand(len(centre))
-    for start in range(0, len(centre), chunk):
-        part = slice(start, start + chunk)
-        distance = torch.cdist(centre[part], centre, compute_mode="donot_use_mm_for_euclid_dist")
-        near = (distance < reaches[part, None]) & (normal[part] @ normal.T > agree)
-        i, j = torch.nonzero(near, as_tuple=True)
-        i = i + start
-        first.append(i[i != j])
-        second.append(j[i != j])
-    return torch.cat(first), torch.cat(second)
+    if not len(centre):
+        return reaches.new_zeros(0, dtype=torch.long), reaches.new_zeros(0, dtype=torch.long)
+    near = cKDTree(centre.detach().cpu().double().numpy()).query_pairs(
+        float(reaches.max()), output_type="ndarray"
+    )
+    once = torch.from_numpy(near).to(centre.device)
+    both = torch.cat([once, once.flip(1)])
+    i, j = both[torch.argsort(both[:, 0] * len(centre) + both[:, 1])].T
+    distance = (centre[i] - centre[j]).norm(dim=1)
+    kept = (distance < reaches[i]) & ((normal[i] * normal[j]).sum(1) > agree)
+    return i[kept], j[kept]
 
 
 class Sheet(NamedTuple):
