@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 STEEP = 0.4  # cosine of the tilt up to which a patch covers its whole lateral cell
@@ -270,6 +272,32 @@ def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
     tables = PIECES.to(image).T @ bins
     c0, c1, c2, c3 = (table.index_select(0, place).view(f.shape) for table in tables)
     return c0 + f * (c1 + f * (c2 + f * c3)), c1 + f * (2 * c2 + 3 * f * c3)
+
+
+def spline_matrix(contribution: Tensor, time: Tensor, n_bins: int) -> csr_array:
+    """:class:`SplineSplat` as a matrix, for light that arrives at the same times again and again.
+
+    Args:
+        contribution: ``[B, M, Q]`` of M sources with Q points each, per unit of a source's light.
+        time: ``[B, M, Q]`` in bins.
+        n_bins: T.
+
+    Returns:
+        ``[B·M, B·T]`` on the CPU; what leaves [0, T) is lost. Takes 32 bytes a point.
+
+    Examples:
+        >>> import torch
+        >>> spline_matrix(torch.ones(1, 1, 1), torch.full((1, 1, 1), 2.5), 5).toarray().round(2)
+        array([[0.  , 0.17, 0.67, 0.17, 0.  ]], dtype=float32)
+    """
+    (batch, sources, points), (first, weights) = time.shape, spline_weights(time)
+    into = first[..., None] + torch.arange(4, device=time.device)
+    inside = (into >= 0) & (into < n_bins)
+    row = torch.arange(batch, device=time.device)[:, None, None, None] * n_bins
+    column = (row + into.clamp(0, n_bins - 1)).to(torch.int32).reshape(-1).cpu().numpy()
+    value = (contribution[..., None] * weights * inside).reshape(-1).cpu().numpy()
+    begin = np.arange(batch * sources + 1, dtype=np.int32) * (4 * points)
+    return csr_array((value, column, begin), shape=(batch * sources, batch * n_bins))
 
 
 def _located(time: Tensor, n_bins: int) -> tuple[Tensor, Tensor]:

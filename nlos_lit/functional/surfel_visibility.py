@@ -13,22 +13,27 @@ from torch import Tensor
 
 from nlos_lit.functional.surfel_paths import quadrature, spread
 
-DRAWN = 5  # points along each side of a patch that are drawn
-PIXEL = 0.35  # of a cell, for the nearest patches: more than those points lie apart on slanted ones
+PIXEL = 1.75  # widths of a patch by the points along each side: they lie farther apart on slanted ones
 NEAR = 0.02  # share of the patches that may lie nearer to the wall than their pixels are fine for
 CLEAR = 1.0  # cells behind a patch's plane up to which it hides nothing: neighbours on a curved sheet
 STEPS = 1 << 20  # of depth a metre, and surfels, at most, that fit into one number with it
 
 
 def who_hides(
-    centre: Tensor, normal: Tensor, cell: Tensor, wall: Tensor, target: Tensor, chunk: int = 1 << 19
+    centre: Tensor,
+    normal: Tensor,
+    cell: Tensor,
+    wall: Tensor,
+    target: Tensor,
+    drawn: int = 5,
+    chunk: int = 1 << 19,
 ) -> Tensor:
     """The first patch that straight lines from wall points to targets pierce.
 
-    What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel: 0.35 of a
-    cell for the nearest patches, one cell for those 2.9 times farther away. A target may be an extended one,
-    of K points: each lies in a pixel of its own, and their middle says on which side of a plane they are, so
-    that a curved sheet does not hide the corners of its own flat patches.
+    What is nearer to the wall than nearly all patches is in view. Outlines are known to a pixel:
+    ``PIXEL/drawn`` of a cell for the nearest patches, more in proportion for those farther away. A target may
+    be an extended one, of K points: each lies in a pixel of its own, and their middle says on which side of a
+    plane they are, so that a curved sheet does not hide the corners of its own flat patches.
 
     Args:
         centre: ``[M, 3]`` m, of the patches that hide.
@@ -36,6 +41,7 @@ def who_hides(
         cell: ``[2]`` lateral extents of a patch, m.
         wall: ``[W, 3]`` wall points, m.
         target: ``[V, K, 3]`` m, points of each target.
+        drawn: points along each side of a patch.
         chunk: points and pixels worked on at once, bounds the memory.
 
     Returns:
@@ -53,9 +59,9 @@ def who_hides(
     found_by = target.new_full((len(wall), *target.shape[:2]), -1, dtype=torch.int32)
     if not len(centre):
         return found_by
-    shift, _ = spread(normal, cell, quadrature(DRAWN, cell.device))
-    drawn = (centre[:, None] + shift).reshape(-1, 3)
-    patch = torch.arange(len(centre), device=wall.device).repeat_interleave(DRAWN**2)
+    shift, _ = spread(normal, cell, quadrature(drawn, cell.device))
+    points = (centre[:, None] + shift).reshape(-1, 3)
+    patch = torch.arange(len(centre), device=wall.device).repeat_interleave(drawn**2)
     side, front = cell.max(), wall[:, 2].max()
     nearest = (torch.quantile(centre[:, 2], NEAR) - front).clamp_min(side)
     middle = target.mean(1)
@@ -64,16 +70,17 @@ def who_hides(
         return found_by
     middle = middle[behind].repeat_interleave(target.shape[1], 0)
     target = target[behind].reshape(-1, 3)
-    pixel = PIXEL * side / nearest
+    width = PIXEL / drawn * side
+    pixel = width / nearest
     level = (normal * centre).sum(1)  # of each patch's plane
     # No line of sight leaves the box around wall and targets: at most so many pixels across.
     across = torch.cat([wall[:, :2], target[:, :2]])
-    pixels = int(((across.amax(0) - across.amin(0)) / (PIXEL * side) + 3).prod())
+    pixels = int(((across.amax(0) - across.amin(0)) / width + 3).prod())
     first = 0
-    for part in wall.split(max(1, chunk // (len(drawn) + len(target) + pixels))):
+    for part in wall.split(max(1, chunk // (len(points) + len(target) + pixels))):
         rows = slice(first, first + len(part))
         first = rows.stop
-        (u, v, z), (tu, tv, tz) = _seen_from(part, drawn, pixel), _seen_from(part, target, pixel)
+        (u, v, z), (tu, tv, tz) = _seen_from(part, points, pixel), _seen_from(part, target, pixel)
         left, low = tu.amin(1, keepdim=True) - 1, tv.amin(1, keepdim=True) - 1
         wide, high = int((tu - left).max()) + 2, int((tv - low).max()) + 2
         # What lies beside the targets' window is drawn on its rim, where no target looks.

@@ -40,7 +40,8 @@ from nlos_lit.model.parameters import BoundedParameter
 UNKNOWN = 0.5  # opacity of a surfel of which the counts have said nothing yet …
 WHOLE = 0.6  # … from this share of the mean albedo on; of fainter ones in proportion, since they may be false
 HIDING = 0.1  # opacity below which a surfel is not drawn: it would stand before what does hide
-LOOKED = 2  # points along each side of a surfel at which it is looked who hides it
+LOOKED = 2.0  # bins that points of a surfel lie apart at which it is looked who hides it, at most two …
+DRAWN = 0.5  # … and those at which it is drawn, at most five along each side
 
 
 class Lateral(NamedTuple):
@@ -262,7 +263,7 @@ class SurfelModel(nn.Module):
 
     @torch.no_grad()
     def update_hiders(self, spots: Tensor | None = None) -> None:
-        """Find who hides each surfel, at ``LOOKED`` × ``LOOKED`` points of it: see :meth:`hidden_by`.
+        """Find who hides each surfel, at :meth:`points_of` it: see :meth:`hidden_by`.
 
         Args:
             spots: ``[B]`` rows of the capture; the others see all. None finds it for every spot.
@@ -282,8 +283,12 @@ class SurfelModel(nn.Module):
         Returns:
             ``[V, K, 3]`` m.
         """
-        shift, _ = spread(normal, self.cell, quadrature(LOOKED, self.cell.device))
+        shift, _ = spread(normal, self.cell, quadrature(self._points_apart(LOOKED, 2), self.cell.device))
         return centre[:, None] + shift
+
+    def _points_apart(self, bins: float, most: int) -> int:
+        """Points along each side of a surfel that lie no more than so far apart."""
+        return min(most, max(1, math.ceil(float(self.cell.max()) / (bins * self.bin_length) - 1e-6)))
 
     @torch.no_grad()
     def hidden_by(self, spots: Tensor, places: Tensor) -> Tensor:
@@ -299,10 +304,11 @@ class SurfelModel(nn.Module):
         centre, normal = self.placed()
         drawn = torch.nonzero(self.opacity() > HIDING)[:, 0]
         number = torch.cat([drawn.new_zeros(1), drawn + 1]).to(torch.int32)
+        along = self._points_apart(DRAWN, 5)
 
         def found(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
-            by = who_hides(centre[drawn], normal[drawn], self.cell, points, places)
+            by = who_hides(centre[drawn], normal[drawn], self.cell, points, places, along)
             return number[by + 1][row]
 
         legs = [self.laser] if self.confocal else [self.laser, self.sensor]
@@ -347,13 +353,24 @@ class SurfelModel(nn.Module):
         Returns:
             ``[B, T]`` from the capture's bin 0 to the gate's end.
         """
-        albedo = self.albedo() if albedo is None else albedo
-        energy, length = (
-            hooks.path(paths.contribution * albedo[:, None], paths, spots),
-            hooks.time(paths.length, paths, spots),
-        )
-        transients = SplineSplat.apply(energy.flatten(1), self.arrival(length).flatten(1), self.n_bins)
+        energy, time = self.arrivals(paths, spots, hooks, self.albedo() if albedo is None else albedo)
+        transients = SplineSplat.apply(energy.flatten(1), time.flatten(1), self.n_bins)
         return hooks.transients(transients, energy, paths, spots)
+
+    def arrivals(self, paths: Paths, spots: Tensor, hooks: Hooks, albedo: Tensor) -> tuple[Tensor, Tensor]:
+        """Stage 2: energy of each path, and when it arrives.
+
+        Args:
+            paths: of the spots, for unit albedo.
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act on paths and times.
+            albedo: ``[M]``.
+
+        Returns:
+            ``[B, M, Q]`` each, the second in bins from the capture's bin 0.
+        """
+        energy = hooks.path(paths.contribution * albedo[:, None], paths, spots)
+        return energy, self.arrival(hooks.time(paths.length, paths, spots))
 
     def signal(self, transients: Tensor, hooks: Hooks) -> Tensor:
         """Stage 4: transients through the response.

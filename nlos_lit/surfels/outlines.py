@@ -8,15 +8,19 @@ the likeliest albedo is zero.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from scipy.optimize import minimize
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import ring
+from nlos_lit.functional.surfel_paths import spline_matrix
 from nlos_lit.surfels.growth import within_depths
 from nlos_lit.surfels.model import SurfelModel
 
@@ -59,6 +63,24 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         model.hiders = hiders
 
 
+class _Linear(NamedTuple):
+    """What albedos have to do with the light that arrives at some spots, while all else stands still."""
+
+    spots: Tensor  # [B]
+    splat: csr_array  # [B·M, B·T], transients by each surfel's albedo
+    other: Tensor  # [B, T] light that arrives besides
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, model: SurfelModel, spots: Tensor, hooks: Hooks) -> _Linear:
+        paths, albedo = model.paths(spots), model.albedo()
+        energy, time = model.arrivals(paths, spots, hooks, torch.ones_like(albedo))
+        splat = spline_matrix(energy, time, model.n_bins)
+        direct = torch.from_numpy(splat.T @ albedo.repeat(len(spots)).cpu().numpy()).to(albedo.device)
+        direct = direct.view(len(spots), -1)
+        return cls(spots, splat, hooks.transients(direct, energy * albedo[:, None], paths, spots) - direct)
+
+
 def solve_albedos(
     model: SurfelModel,
     spots: Tensor,
@@ -72,7 +94,7 @@ def solve_albedos(
 
     It minimises ``Σ (μ - H ln μ)`` and the albedos' own cost (:meth:`SurfelModel.albedo_cost`) over albedos ≥
     0. Each spot counts once, however few of all they are: what they leave open their noise must not say.
-    Paths are traced once.
+    Paths are traced once; light that takes other ways (fourth bounces) stays what it is.
 
     Args:
         model: whose albedos are set, linked.
@@ -83,23 +105,25 @@ def solve_albedos(
         iterations: at most.
         hooks: effects, which stand still.
     """
-    device, level = counts.device, float(level_of(model.albedo()))
-    size = max(1, CHUNK // max(1, len(model) * model.quadrature**2))
-    with torch.no_grad():
-        parts = [(part, model.paths(part)) for part in spots.split(size)]
+    device, level, m = counts.device, float(level_of(model.albedo())), len(model)
+    size = max(1, CHUNK // max(1, m * model.quadrature**2))
+    parts = [_Linear.of(model, part, hooks) for part in spots.split(size)]
     first = model.gate[0]
 
     def cost(levels: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.tensor(levels, dtype=torch.float32, device=device, requires_grad=True)
         prior = model.albedo_cost(evenness, brightness, level * x)
-        total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0]
-        for (part, paths), seen in zip(parts, counts.split(size), strict=True):
-            arriving = model.transients(paths, part, hooks, level * x)
+        total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0].double().cpu().numpy()
+        sent = (level * levels).astype(np.float32)
+        for (part, splat, other), seen in zip(parts, counts.split(size), strict=True):
+            direct = torch.from_numpy(splat.T @ np.tile(sent, len(part))).view(other.shape).to(device)
+            arriving = (direct + other).requires_grad_()
             expected = model.record(arriving, part, hooks)[:, first:].clamp_min(1e-9).double()
             nats = (expected - seen - torch.xlogy(seen.double(), expected / seen.clamp_min(1))).sum()
-            slope = slope + torch.autograd.grad(nats, x)[0]
+            pull = torch.autograd.grad(nats, arriving)[0].reshape(-1).cpu().numpy()
+            slope += level * (splat @ pull).reshape(-1, m).sum(0)
             total += float(nats.detach())
-        return total, slope.double().cpu().numpy()
+        return total, slope
 
     begin = (model.albedo().detach() / level).double().cpu().numpy()
     found = minimize(
