@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -88,8 +89,45 @@ def convolve_time(transients: Tensor, kernel: Tensor, lead: int) -> Tensor:
         >>> convolve_time(spike, torch.tensor([0.25, 0.5, 0.25]), lead=1).round()
         tensor([[0., 2., 4., 2., 0.]])
     """
-    bins, length = transients.shape[1], kernel.shape[0]
-    size = bins + length - 1
-    size += size % 2
-    product = torch.fft.rfft(transients, size) * torch.fft.rfft(kernel, size)
-    return torch.fft.irfft(product, size)[:, lead : lead + bins]
+    return _Convolution.apply(transients, kernel, lead)
+
+
+class _Convolution(torch.autograd.Function):
+    """:func:`convolve_time`; its derivatives take as many real transforms as itself."""
+
+    @staticmethod
+    def forward(transients: Tensor, kernel: Tensor, lead: int) -> Tensor:
+        bins, size = transients.shape[1], _whole(transients, kernel)
+        product = torch.fft.rfft(transients, size) * torch.fft.rfft(kernel, size)
+        return torch.fft.irfft(product, size)[:, lead : lead + bins]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
+        transients, kernel, ctx.lead = inputs
+        ctx.save_for_backward(transients, kernel)
+        ctx.save_for_forward(transients, kernel)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+        transients, kernel = ctx.saved_tensors
+        bins, size = transients.shape[1], _whole(transients, kernel)
+        pull = torch.fft.rfft(torch.nn.functional.pad(grad, (ctx.lead, 0)), size)
+        of_light = torch.fft.irfft(pull * torch.fft.rfft(kernel, size).conj(), size)[:, :bins]
+        of_kernel = (pull * torch.fft.rfft(transients, size).conj()).sum(0)
+        return of_light, torch.fft.irfft(of_kernel, size)[: len(kernel)], None
+
+    @staticmethod
+    def jvp(ctx: Any, d_transients: Tensor | None, d_kernel: Tensor | None, _: None) -> Tensor:
+        transients, kernel = ctx.saved_tensors
+        changed = torch.zeros_like(transients)
+        if d_transients is not None:
+            changed = changed + convolve_time(d_transients, kernel, ctx.lead)
+        if d_kernel is not None:
+            changed = changed + convolve_time(transients, d_kernel, ctx.lead)
+        return changed
+
+
+def _whole(transients: Tensor, kernel: Tensor) -> int:
+    """Bins of the transforms: an even number, into which the whole convolution fits."""
+    size = transients.shape[1] + len(kernel) - 1
+    return size + size % 2

@@ -130,33 +130,37 @@ def trace(
         (0.0001, 2.0)
     """
     shift, area = spread(normal, cell, offsets)
-    points = (centre[:, None] + shift).unbind(2)
+    # Near the middle of the wall, so that differences of squares keep their digits.
+    middle = laser.mean(0)
+    points, at = centre[:, None] + shift - middle, centre - middle
     share = (area / len(offsets))[:, None]
-    factor, leg, cosine = _leg(points, normal, laser, laser_normal)
+    factor, leg, cosine = _leg(points, at, normal, laser - middle, laser_normal)
     if confocal:
         return Paths(share * factor**2, 2 * leg, leg, leg, cosine, cosine, centre, normal, area)
-    other, other_leg, other_cosine = _leg(points, normal, sensor, sensor_normal)
+    other, other_leg, other_cosine = _leg(points, at, normal, sensor - middle, sensor_normal)
     legs = (leg, other_leg, cosine, other_cosine)
     return Paths(share * factor * other, leg + other_leg, *legs, centre, normal, area)
 
 
 def _leg(
-    points: tuple[Tensor, ...], facing: Tensor, wall: Tensor, normal: Tensor
+    points: Tensor, centre: Tensor, facing: Tensor, wall: Tensor, normal: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points ``[B, 3]`` to points.
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points ``[B, 3]`` to ``[M, Q, 3]``.
 
-    Each is ``[B, M, Q]``.
+    Each is ``[B, M, Q]``. Squares of distances and distances from planes are sums of products of what belongs
+    to the wall point and what belongs to the surfel, so that they are products of matrices.
     """
-    dx, dy, dz = (p - wall[:, k, None, None] for k, p in enumerate(points))
-    square = dx * dx + dy * dy + dz * dz
-    n = normal[:, :, None, None]
-    at_wall = (n[:, 0] * dx + n[:, 1] * dy + n[:, 2] * dz).clamp_min(0)
+    flat, one = points.reshape(-1, 3), wall.new_ones(len(wall), 1)
+    size = (flat**2).sum(1, keepdim=True)
+    whole = torch.cat([flat, size, torch.ones_like(size)], 1)
+    square = torch.cat([-2 * wall, one, (wall**2).sum(1, keepdim=True)], 1) @ whole.T
+    at_wall = torch.cat([normal, -(normal * wall).sum(1, keepdim=True)], 1) @ whole[:, [0, 1, 2, 4]].T
     # The points of one surfel lie in one plane, whose distance from the wall point is the same for all of
     # them.
-    plane = -(
-        facing[:, 0, None] * dx[..., :1] + facing[:, 1, None] * dy[..., :1] + facing[:, 2, None] * dz[..., :1]
-    ).clamp_max(0)
-    distance = torch.sqrt(square)
+    plane = torch.cat([wall, one], 1) @ torch.cat([facing, -(facing * centre).sum(1, keepdim=True)], 1).T
+    shape = (len(wall), *points.shape[:2])
+    square, at_wall = square.clamp_min(1e-12).view(shape), at_wall.clamp_min(0).view(shape)
+    plane, distance = plane.clamp_min(0)[..., None], torch.sqrt(square)
     return at_wall * plane / square**2, distance, plane / distance
 
 

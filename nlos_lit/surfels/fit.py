@@ -530,10 +530,11 @@ class SurfelFit:
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
-        expected = model.render(self.train[rows], self.extension).clamp_min(1e-12)
+        placed = model.placed()
+        expected = model.render(self.train[rows], self.extension, placed).clamp_min(1e-12)
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
-            "bending": s.bending * per_count * model.bending(),
+            "bending": s.bending * per_count * model.bending(placed),
             "albedos": per_count * model.albedo_cost(s.evenness, s.brightness),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }

@@ -233,9 +233,16 @@ class SurfelModel(nn.Module):
         albedo = self.albedo().detach()
         return albedo / (albedo + 0.3 * albedo.mean())
 
-    def bending(self) -> Tensor:
-        """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`."""
-        return bending(*self.placed(), self.trust(), self.pairs)
+    def bending(self, placed: tuple[Tensor, Tensor]) -> Tensor:
+        """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`.
+
+        Args:
+            placed: from :meth:`placed`.
+
+        Returns:
+            A scalar, differentiable.
+        """
+        return bending(*placed, self.trust(), self.pairs)
 
     def albedo_cost(self, evenness: float, bright: float, albedo: Tensor | None = None) -> Tensor:
         """What albedos cost that differ between neighbours, or exceed the scene's own level.
@@ -327,11 +334,19 @@ class SurfelModel(nn.Module):
         legs = [passes.index_select(0, leg.reshape(-1)).view(leg.shape) for leg in hiders]
         return math.prod(legs[1:], start=legs[0]).mean(2)
 
-    def paths(self, spots: Tensor) -> Paths:
-        """Stage 1: all paths of ``spots`` ``[B]`` over all surfels, for unit albedo."""
+    def paths(self, spots: Tensor, placed: tuple[Tensor, Tensor] | None = None) -> Paths:
+        """Stage 1: all paths over all surfels, for unit albedo.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            placed: from :meth:`placed`, where it is known.
+
+        Returns:
+            the paths.
+        """
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
-        paths = trace(*self.placed(), self.cell, offsets, *walls, self.confocal)
+        paths = trace(*(placed or self.placed()), self.cell, offsets, *walls, self.confocal)
         if len(self.hiders):
             seen = self.arriving(self.hiders[:, spots])
             paths = paths._replace(contribution=paths.contribution * seen[:, :, None])
@@ -428,17 +443,20 @@ class SurfelModel(nn.Module):
         """
         return self.detect(self.signal(transients, hooks), spots, hooks)
 
-    def render(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
+    def render(
+        self, spots: Tensor, hooks: Hooks = NOTHING, placed: tuple[Tensor, Tensor] | None = None
+    ) -> Tensor:
         """All stages.
 
         Args:
             spots: ``[B]`` rows of the capture.
             hooks: effects.
+            placed: from :meth:`placed`, where it is known.
 
         Returns:
             ``[B, T_gate]`` expected counts.
         """
-        transients = self.transients(self.paths(spots), spots, hooks)
+        transients = self.transients(self.paths(spots, placed), spots, hooks)
         return self.record(transients, spots, hooks)[:, self.gate[0] :]
 
     forward = render
