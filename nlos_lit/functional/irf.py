@@ -99,7 +99,7 @@ class _Convolution(torch.autograd.Function):
     def forward(transients: Tensor, kernel: Tensor, lead: int) -> Tensor:
         bins, size = transients.shape[1], _whole(transients, kernel)
         product = torch.fft.rfft(transients, size) * torch.fft.rfft(kernel, size)
-        return torch.fft.irfft(product, size)[:, lead : lead + bins]
+        return torch.fft.irfft(product, size)[:, lead : lead + bins].contiguous()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:

@@ -7,6 +7,7 @@ import mpmath
 import numpy as np
 import pytest
 import torch
+from inference_scenes import FORWARD_MODE
 from scipy.stats import exponnorm
 
 from nlos_lit.functional.irf import convolve_time, emg_cdf, response
@@ -126,3 +127,11 @@ def test_convolve_time_is_numpys(bins, length, lead):
     found = convolve_time(torch.from_numpy(transients), torch.from_numpy(kernel), lead).numpy()
     expected = np.stack([np.convolve(row, kernel)[lead : lead + bins] for row in transients])
     assert np.allclose(found, expected, atol=1e-12)
+
+
+@FORWARD_MODE
+def test_derivatives_of_the_convolution_are_exact():
+    gen = torch.Generator().manual_seed(0)
+    light, kernel = torch.rand(3, 12, generator=gen, dtype=DOUBLE), torch.rand(5, generator=gen, dtype=DOUBLE)
+    inputs = (light.requires_grad_(), kernel.requires_grad_())
+    assert torch.autograd.gradcheck(lambda a, b: convolve_time(a, b, 2), inputs, check_forward_ad=True)

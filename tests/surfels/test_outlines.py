@@ -104,6 +104,28 @@ def test_effects_stand_still_and_are_seen_through():
     assert errors[0] < 0.5 * errors[1]
 
 
+def test_fourth_bounces_stay_what_they_are():
+    """They are no linear function of the albedos."""
+    fourth = Extension([effect_of("higher_order_bounces", Scan.of(WALL), strength=40.0)])
+
+    def corner(albedo: float) -> SurfelModel:
+        model = board(torch.full((5, 5), albedo))
+        centre, side = model.centre(), model.centre()[:, :1].sign()
+        centre = centre + torch.cat([torch.zeros(25, 2), -centre[:, :1].abs()], 1)
+        model.place(centre, torch.cat([-side, 0 * side, -torch.ones(25, 1)], 1), model.albedo())
+        return model
+
+    true = corner(1.0)
+    counts, without = true.expected(SPOTS, fourth), true.expected(SPOTS)
+    assert (counts - without).sum() > 0.02 * without.sum()
+    seen, blind = corner(0.9), corner(0.9)
+    for model, extension in ((seen, fourth), (blind, Extension([]))):
+        for _ in range(3):  # each with those of the albedos before
+            solve_albedos(model, SPOTS, counts, 0.7, 1.0, SEARCH, extension)
+    errors = [(m.albedo() - 1).abs().mean().item() for m in (seen, blind)]
+    assert errors[0] < 0.5 * errors[1]
+
+
 def test_rings_lie_within_the_grid_hide_nothing_and_are_hidden():
     model = board(torch.ones(3, 3))
     front = torch.tensor([[0.0, 0.0, 0.4]])

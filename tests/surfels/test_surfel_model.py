@@ -22,7 +22,13 @@ from nlos_lit.functional.surfel_graph import (
     misfits,
     neighbour_pairs,
 )
-from nlos_lit.functional.surfel_paths import SplineSplat, quadrature, spline_weights, spread
+from nlos_lit.functional.surfel_paths import (
+    SplineSplat,
+    quadrature,
+    spline_matrix,
+    spline_weights,
+    spread,
+)
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import HIDING, Lateral, SurfelModel, spline_sensor, unknown_opacity
 
@@ -117,6 +123,28 @@ def test_spline_has_exact_energy_mean_and_variance_at_every_phase():
 def test_splat_drops_what_leaves_the_window():
     image = SplineSplat.apply(torch.tensor([[1.0, 1.0, 1.0]]), torch.tensor([[-7.0, 5.5, 99.0]]), 10)
     assert image[0].tolist() == pytest.approx([0, 0, 0, 0, 1 / 6, 4 / 6, 1 / 6, 0, 0, 0], abs=1e-6)
+
+
+def test_the_splat_as_a_matrix_is_the_splat():
+    gen = torch.Generator().manual_seed(0)
+    energy, time = torch.rand(2, 3, 4, generator=gen), 30 * torch.rand(2, 3, 4, generator=gen) - 5
+    albedo = torch.tensor([0.5, 0.0, 2.0])
+    expected = SplineSplat.apply((energy * albedo[:, None]).flatten(1), time.flatten(1), 20)
+    found = spline_matrix(energy, time, 20).T @ albedo.repeat(2).numpy()
+    assert torch.from_numpy(found).view(2, 20) == pytest.approx(expected, abs=1e-6)
+
+
+def test_legs_keep_their_digits_far_from_the_origin():
+    """Products of matrices lose what squares have in common; the wall's middle has little in common."""
+    model, spots = random_model()
+    with torch.no_grad():
+        near = model.paths(spots)
+    for points in (model.laser, model.sensor, model.anchor):
+        points += torch.tensor([64.0, -32.0, 8.0])
+    with torch.no_grad():
+        away = model.paths(spots)
+    assert away.length == pytest.approx(near.length, abs=3e-5)  # m; coordinates themselves have 4e-6
+    assert away.contribution == pytest.approx(near.contribution, rel=1e-3)
 
 
 def test_plate_has_the_simulators_transients():
@@ -278,6 +306,15 @@ def test_a_surfel_is_hidden_in_part_past_an_edge():
         model.place(centre, facing, torch.ones(3), torch.full((3,), 0.8))
         model.update_hiders()
         assert model.arriving(model.hiders).tolist() == [pytest.approx([1.0, 1 - 0.8 * part, 1.0])]
+
+
+@pytest.mark.parametrize(("bins", "points"), [(1.5, 1), (2.0, 1), (2.1, 4), (4.0, 4)])
+def test_fine_surfels_are_looked_at_in_the_middle_alone(bins, points):
+    capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    model = build(capture, [[0.0, 0.0, 0.5], [0.0, 0.0, 1.0]], cell=bins * capture.bin_length)
+    model.update_hiders()
+    assert model.hiders.shape == (1, 1, 2, points)
+    assert (model.hiders[0, 0, 1] == 1).all()
 
 
 def test_light_is_hidden_from_laser_and_from_sensor():
