@@ -26,7 +26,7 @@ def who_hides(
     wall: Tensor,
     target: Tensor,
     drawn: int = 5,
-    chunk: int = 1 << 19,
+    chunk: int = 1 << 20,
 ) -> Tensor:
     """The first patch that straight lines from wall points to targets pierce.
 
@@ -76,34 +76,50 @@ def who_hides(
     # No line of sight leaves the box around wall and targets: at most so many pixels across.
     across = torch.cat([wall[:, :2], target[:, :2]])
     pixels = int(((across.amax(0) - across.amin(0)) / width + 3).prod())
-    first = 0
-    for part in wall.split(max(1, chunk // (len(points) + len(target) + pixels))):
-        rows = slice(first, first + len(part))
-        first = rows.stop
-        (u, v, z), (tu, tv, tz) = _seen_from(part, points, pixel), _seen_from(part, target, pixel)
-        left, low = tu.amin(1, keepdim=True) - 1, tv.amin(1, keepdim=True) - 1
-        wide, high = int((tu - left).max()) + 2, int((tv - low).max()) + 2
-        # What lies beside the targets' window is drawn on its rim, where no target looks.
-        at = (u - left).clamp_(0, wide - 1) * high + (v - low).clamp_(0, high - 1)
-        code = (z * STEPS).long() * STEPS + patch
-        picture = torch.full((len(part), wide * high), 1 << 62, device=wall.device)
-        picture.scatter_reduce_(1, at.long(), code, "amin")
-        found = picture.gather(1, ((tu - left) * high + (tv - low)).long())
-        at_front = found // STEPS < (tz * STEPS).long()
-        hider = torch.where(at_front, found % STEPS, 0)
-        n = normal[hider]
-        plane = level[hider]
-        own = (n * middle).sum(2) - plane
-        eye = (n * part[:, None]).sum(2) - plane
-        hidden = at_front & (own * eye < 0) & (own.abs() > CLEAR * side)
-        by = torch.where(hidden, hider, -1).to(torch.int32)
-        found_by[rows, behind] = by.view(len(part), len(behind), -1)
+    size = max(1, chunk // (len(points) + len(target) + pixels))
+    for height in wall[:, 2].unique():  # one, mostly: depths are those of all wall points
+        drawn_at, depth = _seen_from(height, points, pixel)
+        looked_at, own_depth = _seen_from(height, target, pixel)
+        code = depth * STEPS + patch
+        for rows in torch.nonzero(wall[:, 2] == height)[:, 0].split(size):
+            part = wall[rows]
+            tu, tv = _columns(part, looked_at, 0.0, 0.0)
+            left, low = tu.amin(1, keepdim=True) - 1, tv.amin(1, keepdim=True) - 1
+            tu, tv = tu - left, tv - low
+            wide, high = int(tu.max()) + 2, int(tv.max()) + 2
+            # What lies beside the targets' window is drawn on its rim, where no target looks.
+            u, v = _columns(part, drawn_at, left, low)
+            at = u.clamp_(0, wide - 1).mul_(high).add_(v.clamp_(0, high - 1)).long()
+            picture = torch.full((len(part), wide * high), 1 << 62, device=wall.device)
+            picture.scatter_reduce_(1, at, code.expand(len(part), -1), "amin")
+            found = picture.gather(1, (tu * high + tv).long())
+            at_front = found < own_depth * STEPS
+            hider = torch.where(at_front, found % STEPS, 0)
+            own = (normal[hider] * middle).sum(2) - level[hider]
+            eye = (part @ normal.T - level).gather(1, hider)
+            hidden = at_front & (own * eye < 0) & (own.abs() > CLEAR * side)
+            by = torch.where(hidden, hider, -1).to(torch.int32).view(len(part), len(behind), -1)
+            found_by[rows[:, None], behind] = by
     return found_by
 
 
-def _seen_from(wall: Tensor, points: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Column and row of ``[P, 3]`` points in the picture from each of ``[W, 3]`` wall points, and depth."""
-    x, y, z = (points[:, k] - wall[:, k, None] for k in range(3))
-    z = z.clamp_min(1e-3)
-    scale = 1 / (z * pixel)
-    return (x * scale).round_(), (y * scale).round_(), z
+def _seen_from(height: Tensor, points: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    """What pictures from wall points of one height have in common: ``[3, P]``, from which :func:`_columns`
+    are, and depths ``[P]`` in steps.
+    """
+    depth = (points[:, 2] - height).clamp_min(1e-3)
+    scale = 1 / (depth * pixel)
+    return torch.stack([scale, points[:, 0] * scale, points[:, 1] * scale]), (depth * STEPS).long()
+
+
+def _columns(wall: Tensor, seen: Tensor, left: Tensor | float, low: Tensor | float) -> tuple[Tensor, Tensor]:
+    """Column and row ``[W, P]`` in the picture from each of ``[W, 3]`` wall points, from ``left`` and ``low``
+    on ``[W, 1]``, as floats.
+    """
+    one = wall.new_ones(len(wall), 1)
+    places = torch.cat([seen, torch.ones_like(seen[:1])])
+
+    def along(k: int, first: Tensor | float) -> Tensor:
+        return (torch.cat([-wall[:, k : k + 1], one, 0.5 - first * one], 1) @ places[[0, k + 1, 3]]).floor_()
+
+    return along(0, left), along(1, low)

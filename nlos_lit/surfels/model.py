@@ -316,7 +316,7 @@ class SurfelModel(nn.Module):
         def found(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
             by = who_hides(centre[drawn], normal[drawn], self.cell, points, places, along)
-            return number[by + 1][row]
+            return number.index_select(0, by.flatten() + 1).view(by.shape).index_select(0, row)
 
         legs = [self.laser] if self.confocal else [self.laser, self.sensor]
         return torch.stack([found(wall[spots]) for wall in legs])
