@@ -150,13 +150,15 @@ def solve_spots(fit: SurfelFit) -> SurfelFit:
 def go_on(fit: SurfelFit) -> SurfelFit:
     """Some more batches, at falling rates.
 
+    Numbers of single spots stay until the scene has got used to the terms that came or left: they would take
+    up whatever it lacks at first, and the scene could not get it back.
+
     Args:
         fit: that goes on, in place.
 
     Returns:
         the same fit.
     """
-    solve_spots(fit)
     fit.go_on(WARM)
     return solve_spots(fit)
 
