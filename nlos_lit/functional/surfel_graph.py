@@ -17,6 +17,7 @@ BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
 EDGE = 0.3  # of the scene's level: differences of albedo beyond it are edges, and cost little more
 ALIKE = 0.05  # … below it are none, and cost next to nothing
 LEVEL = 0.75  # of the light comes from surfels no brighter than the scene's own level
+CURVED = 1.0  # rad by which a surfel turns from one side to the other, at most
 BRIGHT = 0.2  # deviation of ln(albedo) above that level
 
 
@@ -69,6 +70,11 @@ class Sheet(NamedTuple):
     own: Tensor  # [M] share of i in it
     rim: Tensor  # [M] how far neighbours lie to one side: 0 all around, 1 where half of them are missing
 
+    @property
+    def as_it_was(self) -> bool:
+        """Normals began as they were before."""
+        return bool(self.rest.any())
+
 
 def lay_sheet(
     centre: Tensor,
@@ -117,6 +123,38 @@ def lay_sheet(
     reach = torch.zeros_like(aside).index_add(0, i, trust * along.norm(dim=1))
     rim = (math.pi / 2 * aside / reach.clamp_min(1e-12)).clamp_max(1.0)
     return Sheet(pairs, normal, first, second, share, rest, bow, mean, own, rim)
+
+
+def curvature_of(sheet: Sheet, normal: Tensor, cell: float) -> Tensor:
+    """How surfels curve: the change of the normal from each to its neighbours, by weighted least squares.
+
+    The weights are those of the planes (:func:`lay_sheet`), so that a surfel with few neighbours is flat.
+
+    Args:
+        sheet: from :func:`lay_sheet`.
+        normal: ``[M, 3]`` unit.
+        cell: lateral extent of a surfel, m, over which none turns by more than ``CURVED``.
+
+    Returns:
+        ``[M, 3, 3]`` 1/m, symmetric, in the tangent planes.
+
+    Examples:
+        >>> import torch
+        >>> row = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.2, 0.0, 1.0]])
+        >>> turning = torch.tensor([[-0.1, 0.0, -1.0], [0.0, 0.0, -1.0], [0.1, 0.0, -1.0]])
+        >>> sheet = lay_sheet(row, turning, torch.ones(3), neighbour_pairs(row, turning, 0.15), 0.1)
+        >>> round(float(curvature_of(sheet, turning, 0.1)[1, 0, 0]), 2)  # 1 but for the ridge
+        0.82
+    """
+    i, j = sheet.pairs
+    change = sheet.share[:, :, None] * (normal[j] - normal[i])[:, None]
+    slope = torch.zeros(len(normal), 2, 3, device=normal.device).index_add(0, i, change)
+    turn = torch.einsum("ma,mb->mba", sheet.first, slope[:, 0])
+    turn = turn + torch.einsum("ma,mb->mba", sheet.second, slope[:, 1])
+    plane = torch.eye(3, device=normal.device) - normal[:, :, None] * normal[:, None]
+    turn = plane @ (turn + turn.mT) @ plane / 2
+    size = turn.flatten(1).norm(dim=1) * cell / CURVED
+    return turn / size.clamp_min(1.0)[:, None, None]
 
 
 def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:

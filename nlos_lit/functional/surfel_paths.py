@@ -1,11 +1,12 @@
 """Light paths over flat surface elements (surfels): throughput, length, and how they fill time bins.
 
-A surfel is a flat patch over a lateral cell, given by its centre and normal. Its path from the laser's wall
-point over the surfel to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
+A surfel is a patch over a lateral cell, given by its centre, normal and curvature. Its path from the laser's
+wall point over the surfel to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)
 
     K = A cosθ1 cosθ2 cosθ3 cosθ4 / (d1² d2²)      at length d1 + d2,
 
-A the surfel's true area. A cell is integrated with n × n points, so that arrival times vary smoothly over it.
+A the surfel's true area. A cell is integrated with n × n points, so that arrival times and the angles of a
+curved patch vary smoothly over it.
 """
 
 from __future__ import annotations
@@ -92,6 +93,33 @@ def spread(normal: Tensor, cell: Tensor, offsets: Tensor) -> tuple[Tensor, Tenso
     return torch.cat([lateral, (stretch[:, None] * along)[..., None]], dim=2), cell.prod() * stretch
 
 
+def on_patch(normal: Tensor, shift: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Points and normals of curved patches, of second and first order in the distance from their centres.
+
+    Args:
+        normal: ``[M, 3]`` unit, at the centres.
+        shift: ``[M, Q, 3]`` m, from :func:`spread`, in the tangent planes.
+        curvature: ``[M, 3, 3]`` 1/m, change of the normal along each way in the tangent plane.
+
+    Returns:
+        ``[M, Q, 3]`` places relative to the centres, and unit normals there.
+
+    Examples:
+        On a sphere of radius 1 that bulges towards the wall, 0.1 aside:
+
+        >>> facing, bulge = torch.tensor([[0.0, 0.0, -1.0]]), torch.diag(torch.tensor([1.0, 1.0, 0.0]))
+        >>> place, normal = on_patch(facing, torch.tensor([[[0.1, 0.0, 0.0]]]), bulge[None])
+        >>> [round(x, 3) for x in place.flatten().tolist()]
+        [0.1, 0.0, 0.005]
+        >>> [round(x, 3) for x in normal.flatten().tolist()]
+        [0.1, 0.0, -0.995]
+    """
+    turn = torch.einsum("mij,mqj->mqi", curvature, shift)
+    fallen = (shift * turn).sum(2, keepdim=True) / 2
+    facing = normal[:, None] + turn
+    return shift - fallen * normal[:, None], torch.nn.functional.normalize(facing, dim=2)
+
+
 def trace(
     centre: Tensor,
     normal: Tensor,
@@ -102,6 +130,7 @@ def trace(
     sensor: Tensor,
     sensor_normal: Tensor,
     confocal: bool,
+    curvature: Tensor | None = None,
 ) -> Paths:
     """All third-bounce paths of a batch of spots, laser → surfel → sensor (paper Eq. 6-7).
 
@@ -115,6 +144,7 @@ def trace(
         sensor: ``[B, 3]`` observed wall points, m; not used when ``confocal``.
         sensor_normal: ``[B, 3]`` unit normals there; not used when ``confocal``.
         confocal: whether the sensor looks at the laser's points.
+        curvature: ``[M, 3, 3]`` 1/m, see :func:`on_patch`; None for flat patches.
 
     Returns:
         Paths of B spots over M surfels with Q points each.
@@ -130,37 +160,39 @@ def trace(
         (0.0001, 2.0)
     """
     shift, area = spread(normal, cell, offsets)
+    share, facing = (area / len(offsets))[:, None], normal[:, None].expand_as(shift)
+    if curvature is not None and len(offsets) > 1:
+        shift, facing = on_patch(normal, shift, curvature)
+        # Where a patch covers its lateral cell, what leans more has more area.
+        leans = (-facing[..., 2]).clamp_min(STEEP)
+        share = share * (-normal[:, 2:]).clamp_min(STEEP) / leans
     # Near the middle of the wall, so that differences of squares keep their digits.
     middle = laser.mean(0)
-    points, at = centre[:, None] + shift - middle, centre - middle
-    share = (area / len(offsets))[:, None]
-    factor, leg, cosine = _leg(points, at, normal, laser - middle, laser_normal)
+    points = centre[:, None] + shift - middle
+    factor, leg, cosine = _leg(points, facing, laser - middle, laser_normal)
     if confocal:
         return Paths(share * factor**2, 2 * leg, leg, leg, cosine, cosine, centre, normal, area)
-    other, other_leg, other_cosine = _leg(points, at, normal, sensor - middle, sensor_normal)
+    other, other_leg, other_cosine = _leg(points, facing, sensor - middle, sensor_normal)
     legs = (leg, other_leg, cosine, other_cosine)
     return Paths(share * factor * other, leg + other_leg, *legs, centre, normal, area)
 
 
-def _leg(
-    points: Tensor, centre: Tensor, facing: Tensor, wall: Tensor, normal: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _leg(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points ``[B, 3]`` to ``[M, Q, 3]``.
 
     Each is ``[B, M, Q]``. Squares of distances and distances from planes are sums of products of what belongs
     to the wall point and what belongs to the surfel, so that they are products of matrices.
     """
     flat, one = points.reshape(-1, 3), wall.new_ones(len(wall), 1)
-    size = (flat**2).sum(1, keepdim=True)
+    size, facing = (flat**2).sum(1, keepdim=True), facing.reshape(-1, 3)
     whole = torch.cat([flat, size, torch.ones_like(size)], 1)
     square = torch.cat([-2 * wall, one, (wall**2).sum(1, keepdim=True)], 1) @ whole.T
     at_wall = torch.cat([normal, -(normal * wall).sum(1, keepdim=True)], 1) @ whole[:, [0, 1, 2, 4]].T
-    # The points of one surfel lie in one plane, whose distance from the wall point is the same for all of
-    # them.
-    plane = torch.cat([wall, one], 1) @ torch.cat([facing, -(facing * centre).sum(1, keepdim=True)], 1).T
+    level = (facing * flat).sum(1, keepdim=True)
+    plane = torch.cat([wall, one], 1) @ torch.cat([facing, -level], 1).T
     shape = (len(wall), *points.shape[:2])
     square, at_wall = square.clamp_min(1e-12).view(shape), at_wall.clamp_min(0).view(shape)
-    plane, distance = plane.clamp_min(0)[..., None], torch.sqrt(square)
+    plane, distance = plane.clamp_min(0).view(shape), torch.sqrt(square)
     return at_wall * plane / square**2, distance, plane / distance
 
 

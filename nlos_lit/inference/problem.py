@@ -329,7 +329,7 @@ def _transient_columns(
     def place(rho: Tensor, depth: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
         moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction
         moved = moved + torch.nn.functional.pad(side * model.bin_length / 2, (0, 1))
-        paths = trace(moved, normal, model.cell, offsets, *walls, model.confocal)
+        paths = trace(moved, normal, model.cell, offsets, *walls, model.confocal, model.curvature)
         paths = paths._replace(contribution=paths.contribution * seen)
         energy = extension.path(paths.contribution * rho[:, None], paths, spots)
         return energy, model.arrival(extension.time(paths.length, paths, spots))

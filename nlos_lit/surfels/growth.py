@@ -549,12 +549,13 @@ def _add(model: SurfelModel, kept: Tensor, places: Seeds, gain: Tensor, light: T
     # explain it otherwise.
     chosen = best_apart(places.centre, gain, apart)[: max(64, len(model) // 4)]
     new, begin = places.take(chosen), FIRST_SHARE * light[chosen].float()
-    hiders, opacity = model.hiders, model.opacity()[kept]
+    hiders, opacity, curvature = model.hiders, model.opacity()[kept], model.curvature[kept]
     model.place(
         torch.cat([present.centre, new.centre]),
         torch.cat([present.normal, new.normal]),
         torch.cat([albedo, begin]),
         opacity,
+        curvature,
     )
     if len(hiders):  # until it is worked out anew
         number = torch.cat([kept.new_zeros(1), kept]).cumsum(0) * torch.cat([kept.new_ones(1), kept])

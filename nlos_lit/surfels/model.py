@@ -18,6 +18,7 @@ from nlos_lit.functional.surfel_graph import (
     bending,
     brightness,
     carry_along,
+    curvature_of,
     lay_sheet,
     level_of,
     neighbour_pairs,
@@ -28,6 +29,7 @@ from nlos_lit.functional.surfel_paths import (
     STEEP,
     Paths,
     SplineSplat,
+    on_patch,
     quadrature,
     spread,
     trace,
@@ -74,6 +76,8 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
+        curvature: ``[M, 3, 3]`` 1/m, see :func:`~nlos_lit.functional.surfel_paths.on_patch`; it follows from
+            the normals of neighbours when a sheet is laid or lifted.
         hiders: ``[1 or 2, S, M, K]`` which surfel hides each of K points of every surfel from each spot's
             laser (and sensor, unless confocal), counted from 1; 0 where none does. ``[0, 0, 0, 0]`` where
             nothing is hidden.
@@ -89,6 +93,7 @@ class SurfelModel(nn.Module):
     cell: Tensor
     anchor: Tensor
     direction: Tensor
+    curvature: Tensor
     hiders: Tensor
     observed: Tensor
     pairs: tuple[Tensor, Tensor]
@@ -123,7 +128,14 @@ class SurfelModel(nn.Module):
         self.register_buffer("cell", cell, persistent=False)
         self.place(centre, normal, albedo)
 
-    def place(self, centre: Tensor, normal: Tensor, albedo: Tensor, opacity: Tensor | None = None) -> None:
+    def place(
+        self,
+        centre: Tensor,
+        normal: Tensor,
+        albedo: Tensor,
+        opacity: Tensor | None = None,
+        curvature: Tensor | None = None,
+    ) -> None:
         """Replace all surfels; nothing is hidden until :meth:`update_hiders`.
 
         Args:
@@ -131,6 +143,7 @@ class SurfelModel(nn.Module):
             normal: ``[M, 3]`` of any length, towards the wall's side.
             albedo: ``[M]`` > 0.
             opacity: ``[N]`` of the first N; the others have an :func:`unknown_opacity`, all without any.
+            curvature: ``[N, 3, 3]`` of the first N; the others are flat, all without any.
         """
         device = self.laser.device
         normal = torch.nn.functional.normalize(normal.to(device=device, dtype=torch.float32), dim=1)
@@ -139,6 +152,10 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
+        curved = torch.zeros(len(centre), 3, 3, device=device)
+        if curvature is not None:
+            curved[: len(curvature)] = curvature
+        self.register_buffer("curvature", curved)
         self.register_buffer("hiders", torch.zeros(0, 0, 0, 0, dtype=torch.int32, device=device))
         # In units of a bin there and back, so that one learning rate suits every capture.
         self.raw_depth = nn.Parameter(torch.zeros(len(centre), device=device))
@@ -156,20 +173,22 @@ class SurfelModel(nn.Module):
     @torch.no_grad()
     def keep(self, which: Tensor) -> None:
         """Leave out all surfels but those of ``which`` ``[M]`` bool; nothing is hidden, as after place."""
-        self.place(*(part[which] for part in (*self.placed(), self.albedo(), self.opacity())))
+        parts = (*self.placed(), self.albedo(), self.opacity(), self.curvature)
+        self.place(*(part[which] for part in parts))
 
     @torch.no_grad()
     def divide(self, parts: int) -> None:
-        """Replace each surfel by ``parts`` × ``parts`` smaller ones on its own plane."""
-        normal, pitch = self.normal(), self.lateral.pitch
+        """Replace each surfel by ``parts`` × ``parts`` smaller ones on its own patch."""
+        (whole, normal), pitch = self.placed(), self.lateral.pitch
         shift, _ = spread(normal, self.cell, quadrature(parts, self.cell.device))
-        centre = (self.centre()[:, None] + shift).reshape(-1, 3)
+        shift, facing = on_patch(normal, shift, self.curvature)
+        centre = (whole[:, None] + shift).reshape(-1, 3)
         finer = (pitch[0] / parts, pitch[1] / parts)
         x, y = (o - (parts - 1) / 2 * p for o, p in zip(self.lateral.origin, finer, strict=True))
         nx, ny = self.lateral.shape
         self.lateral, self.cell = Lateral((x, y), finer, (nx * parts, ny * parts)), self.cell / parts
-        same = (normal, self.albedo(), self.opacity())
-        self.place(centre, *(v.repeat_interleave(parts**2, 0) for v in same))
+        same = (self.albedo(), self.opacity(), self.curvature)
+        self.place(centre, facing.reshape(-1, 3), *(v.repeat_interleave(parts**2, 0) for v in same))
 
     def centre(self) -> Tensor:
         """``[M, 3]`` m."""
@@ -217,16 +236,23 @@ class SurfelModel(nn.Module):
         self.lift()
         cell = float(self.cell.max())
         self.sheet = lay_sheet(*self.placed(), self.trust(), self.pairs, cell, as_it_is)
+        self._curve()
 
     @torch.no_grad()
     def lift(self) -> None:
         """Places and normals stay as they are, and stand for themselves from now on."""
         centre, normal = self.placed()
+        self._curve()
         self.raw_normal.copy_(normal)
         self.anchor.copy_(centre)
         self.raw_depth.zero_()
         self.raw_shift.zero_()
         self.sheet = None
+
+    def _curve(self) -> None:
+        """Curvatures that go with the normals of a sheet; they stay where it was laid as it was."""
+        if self.sheet is not None and not self.sheet.as_it_was:
+            self.curvature.copy_(curvature_of(self.sheet, self.normal(), float(self.cell.max())))
 
     def trust(self) -> Tensor:
         """``[M]`` weight of each surfel among its neighbours, from 0 for dark ones to 1."""
@@ -346,7 +372,7 @@ class SurfelModel(nn.Module):
         """
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
-        paths = trace(*(placed or self.placed()), self.cell, offsets, *walls, self.confocal)
+        paths = trace(*(placed or self.placed()), self.cell, offsets, *walls, self.confocal, self.curvature)
         if len(self.hiders):
             seen = self.arriving(self.hiders[:, spots])
             paths = paths._replace(contribution=paths.contribution * seen[:, :, None])

@@ -58,7 +58,7 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         new[:, spots] = model.hidden_by(spots, model.points_of(centre[present:], normal[present:]))
         hiders = torch.cat([hiders, new], 2)
     opacity = torch.cat([model.opacity(), own.new_zeros(len(centre) - present)])
-    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity)
+    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity, model.curvature)
     if len(hiders):
         model.hiders = hiders
 
@@ -151,6 +151,6 @@ def cut_back(model: SurfelModel, before: Tensor) -> None:
     albedo = model.albedo()
     kept, old = albedo > DIM * level_of(albedo), len(before)
     kept[:old] |= before > DIM * level_of(before)
-    known = model.opacity()[:old][kept[:old]]
+    known, curvature = model.opacity()[:old][kept[:old]], model.curvature[kept]
     centre, normal = (part[kept] for part in model.placed())
-    model.place(centre, normal, albedo[kept], known)
+    model.place(centre, normal, albedo[kept], known, curvature)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from data_modules.simulate import ScanPlan, simulate_transients
+from data_modules.simulate import Mesh, ScanPlan, simulate_transients
 from data_modules.simulate.scenes import plate
 from nlos_lit.capture import Capture
 from nlos_lit.effects.hooks import NOTHING, Hooks
@@ -173,6 +173,72 @@ def test_plate_has_the_simulators_transients():
     assert ours.sum(1) == pytest.approx(truth.sum(1), rel=2e-3)
     mean, mean_truth = (ours @ bins.double()) / ours.sum(1), (truth @ bins.double()) / truth.sum(1)
     assert mean == pytest.approx(mean_truth, abs=0.05)  # bins
+
+
+def test_curved_patches_have_the_light_of_a_cylinder():
+    """An upright one, in cells a fifth of its radius wide, by the independent simulator: flat patches lie
+    before it on average, and face all light alike.
+    """
+    radius, step, fine = 0.2, 0.04, 12
+    scan = ScanPlan(kind="confocal", nx=5, ny=2, width=1.4, height=0.4, bin_length=0.01, n_bins=300)
+    laser, sensor = scan.points()
+    up = np.broadcast_to([0.0, 0.0, 1.0], laser.shape)
+    x = np.linspace(-0.14, 0.14, 7 * fine + 1)
+    rim = np.stack([x, 0.8 - np.sqrt(radius**2 - x**2)], 1)
+    vertices = np.array([[a, y, z] for y in (-0.04, 0.04) for a, z in rim])
+    first = np.arange(len(x) - 1)
+    low, high = np.stack([first, first + 1], 1), np.stack([first, first + 1], 1) + len(x)
+    faces = np.concatenate([np.c_[low, high[:, 1]], np.c_[low[:, 0], high[:, ::-1]]])[:, ::-1]
+    mesh = Mesh(vertices, faces, 1.0)
+    given = {"bin_length": 0.01, "n_bins": 300, "occlusion": False}
+    truth = torch.from_numpy(simulate_transients(mesh, laser, sensor, up, up, **given) * math.pi**3)
+    middle = torch.arange(-3, 4) * step
+    normal = torch.stack([middle / radius, 0 * middle, -(1 - (middle / radius) ** 2).sqrt()], 1)
+    centre = torch.stack([middle, 0 * middle, 0.8 + radius * normal[:, 2]], 1)
+    both = torch.cat([centre - torch.tensor([0, 0.02, 0]), centre + torch.tensor([0, 0.02, 0])])
+    turned = torch.cat([normal, normal])
+    model = build(wall(laser, sensor), both.tolist(), turned.tolist(), quadrature=4, cell=step)
+    # The true curvature: 1/radius around the axis, in the tangent plane.
+    around = torch.stack([-turned[:, 2], 0 * turned[:, 2], turned[:, 0]], 1)
+    spots, errors = torch.arange(10), []
+    for curvature in (torch.zeros(14, 3, 3), around[:, :, None] * around[:, None] / radius):
+        model.curvature = curvature
+        ours = model.transients(model.paths(spots), spots, NOTHING).double().detach()
+        bins = torch.arange(300) + 0.5
+        late = (ours @ bins.double()) / ours.sum(1) - (truth @ bins.double()) / truth.sum(1)
+        errors.append(torch.stack([(ours.sum(1) / truth.sum(1) - 1).abs(), late.abs()]).numpy())
+    (flat, flat_late), (curved, curved_late) = errors
+    assert flat.min() > 0.002
+    assert flat_late.min() > 0.03  # bins
+    assert (curved < 0.5 * flat).all()
+    assert (curved_late < 0.4 * flat_late).all()
+
+
+def test_curvature_follows_from_the_normals_of_neighbours():
+    """Of a sphere; a rigid turn of all normals is none."""
+    radius, step = 0.3, 0.03
+    lateral = torch.cartesian_prod(torch.arange(-4, 5), torch.arange(-4, 5)) * step
+    normal = torch.cat([lateral, -(radius**2 - lateral.square().sum(1, keepdim=True)).sqrt()], 1) / radius
+    centre = torch.tensor([0.0, 0.0, 0.9]) + radius * normal
+    model = build(wall([[0.0, 0.0, 0.0]]), centre.tolist(), normal.tolist(), cell=step)
+    model.lay()
+    true = (torch.eye(3) - normal[:, :, None] * normal[:, None]) / radius
+    inner = lateral.abs().amax(1) < 3.5 * step
+    assert model.curvature[inner] == pytest.approx(true[inner], abs=0.3 / radius)
+    trace = model.curvature.diagonal(dim1=1, dim2=2).sum(1)
+    assert trace[inner].mean() == pytest.approx(2 / radius, rel=0.2)  # the ridge keeps a seventh
+    model.lift()
+    before, (at, facing) = model.curvature.clone(), model.placed()
+    model.divide(2)
+    away = (model.centre() - torch.tensor([0.0, 0.0, 0.9])).norm(dim=1)
+    flat_away = (
+        at[:, None] + spread(facing, model.cell * 2, quadrature(2))[0] - torch.tensor([0, 0, 0.9])
+    ).norm(dim=2)
+    assert torch.equal(model.curvature, before.repeat_interleave(4, 0))
+    assert (away - radius).abs().mean() < 0.6 * (flat_away - radius).abs().mean()
+    flat = build(wall([[0.0, 0.0, 0.0]]), [[0.0, 0.0, 0.5], [0.5, 0.0, 0.5]])
+    flat.lay()
+    assert not flat.curvature.any()  # none has a neighbour
 
 
 def test_render_adds_response_and_background_inside_the_gate():
