@@ -5,13 +5,15 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from nlos_lit.functional.surfel_paths import STEEP
+from nlos_lit.functional.surfel_paths import STEEP, on_patch
 
 REACH = 1.0  # cells: deviation of a surfel's weight about its place
 FAR = 2.6  # cells beyond which it has none: two rings, so that a curve shows
 LAYER = 1.2  # cells along z between two sheets
 TAKEN = 0.55  # cells along x and y within which a surfel has a cell: its own, and nearly no other's
 FAINT = 0.03  # of the mean albedo, from which on a surfel has its whole say in where the sheet lies
+BACK = 0.35  # cosine by which flanks may face away from the wall: its far side sees them
+TURN = 0.6  # rad from one patch of a flank to the next, at most: beyond it patches are too long for it
 CHUNK = 1 << 22  # pairs of places and surfels at a time
 
 
@@ -83,6 +85,53 @@ def ring(
     at = torch.cat([places[i[first]], depth[:, None]], 1)
     kept = beside & free
     return at[kept], facing[kept], light[kept]
+
+
+def flank(
+    centre: Tensor, normal: Tensor, curvature: Tensor, source: Tensor, cell: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """How sheets go on where they become too steep for a lattice of lateral cells: the sides of round bodies.
+
+    One patch beyond each surfel, down from the wall, on a surface that goes on curving as it does there. A
+    patch that stands steeply is as long as one that leans just enough to cover its cell.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit, towards the wall's side.
+        curvature: ``[M, 3, 3]`` 1/m.
+        source: ``[M]`` bool, surfels beyond which sheets go on.
+        cell: ``[2]`` lateral extents, m.
+
+    Returns:
+        centres and normals of those that are steep, and which surfel each goes on from.
+
+    Examples:
+        A cylinder of radius 0.1 along y, from a surfel that leans by 60°:
+
+        >>> leaning = torch.tensor([[0.75**0.5, 0.0, -0.5]])
+        >>> along = torch.tensor([[0.5, 0.0, 0.75**0.5]])
+        >>> bend = along[:, :, None] * along[:, None] / 0.1
+        >>> both = torch.ones(1, dtype=torch.bool), torch.tensor([0.02, 0.02])
+        >>> place, facing, _ = flank(0.1 * leaning, leaning, bend, *both)
+        >>> round(float(place.norm()), 3), round(float(facing[0, 2]), 2)
+        (0.101, -0.1)
+    """
+    down = torch.tensor([0.0, 0.0, 1.0], device=centre.device) - normal[:, 2:] * normal
+    leans = down.norm(dim=1, keepdim=True)
+    source = source & (leans[:, 0] > 1e-3)
+    c, n, k = centre[source], normal[source], curvature[source]
+    way, side = (down / leans.clamp_min(1e-3))[source], float(cell.max())
+
+    def length(facing: Tensor) -> Tensor:
+        return side / (-facing[:, 2:]).clamp_min(STEEP)
+
+    own = length(n)
+    _, beyond = on_patch(n, (own * way)[:, None], k)
+    shift, facing = on_patch(n, ((own + length(beyond[:, 0])) / 2 * way)[:, None], k)
+    place, facing = c + shift[:, 0], facing[:, 0]
+    turn = (facing * n).sum(1).clamp(-1, 1).acos()
+    steep = (-facing[:, 2] < STEEP) & (facing[:, 2] < BACK) & (turn < TURN)
+    return place[steep], facing[steep], torch.nonzero(source)[:, 0][steep]
 
 
 def _near(places: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:

@@ -51,6 +51,8 @@ class CriticismSettings:
             pool/level) nats of evidence.
         share: of the misfit that a fine scene leaves, nats; a term needs so much on top, as far as it acts
             where the scene's light falls. What is wrong for unknown reasons may look a little like anything.
+        form: of what other terms take from a term, nats; it needs so much on top. No cause follows an
+            equation to the last digit, and what a strong one leaves looks like its look-alikes.
         most: terms that are tried together at most.
         rivals: look-alikes that are tried in the place of each term that holds, at most.
         open_share: weight above which the capture leaves open that a rival is meant.
@@ -62,6 +64,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 0.01
     share: float = 0.1
+    form: float = 0.05
     most: int = 8
     rivals: int = 2
     open_share: float = 0.05
@@ -409,13 +412,13 @@ class Loop:
             (f"going on without {n}", f"{kept}_but_{n}", partial(self.without, scene, [n])) for n in names
         ]
         whole, *fewer = self.steps.several("fit", jobs, s.processes)
-        own, bar, enough = self._own(scene, names, kept)
+        own, enough = self._own(scene, names, kept)
         value, found = log_likelihood(whole, select), []
         for member, fit in zip(members, fewer, strict=True):
             before = log_likelihood(fit, select)
             gain, weight, explained = self._gained(fit, before, value)
-            evidence, lit = own[member.name]
-            confirmed = Confirmed(evidence, bar(lit), gain, weight, explained)
+            evidence, needed = own[member.name]
+            confirmed = Confirmed(evidence, needed, gain, weight, explained)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
             holds = confirmed.holds(member.candidate.free)
@@ -425,14 +428,13 @@ class Loop:
 
     def _own(
         self, scene: SurfelFit, names: list[str], kept: str
-    ) -> tuple[dict[str, tuple[float, float]], Callable[[float], float], list[str]]:
-        """Own evidence of some terms of a scene, what they need there, and who is left when all who have less
-        are gone.
+    ) -> tuple[dict[str, tuple[float, float]], list[str]]:
+        """Own evidence of some terms of a scene with what they need there, and who is left when all who have
+        less are gone.
         """
         bar = partial(self._bar, self._misfit(scene))
         asking = partial(own_evidence, scene, self.split, self.settings.spots, self.seed, names, bar)
-        own, enough = self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
-        return own, bar, enough
+        return self.steps("screen", f"asking for {', '.join(names)} again", f"{kept}_own", asking)
 
     def single_spots(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """Terms with a number for each spot, which are asked last: with them nothing is predicted for others.
@@ -495,13 +497,13 @@ class Loop:
         gone, came = [name for name, _ in pairs], [new for _, new in pairs]
         bare = self._parted(scene, gone, f"bare{self.number}_{'_'.join(gone)}")
         scene = self.gone_on(bare, [m.candidate for m in came])
-        own, bar, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
+        own, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
         now = dict[str, Member]()
         for member in came:
             none = next(t for t in member.trials if t.candidate is None)
-            evidence, lit = own[member.name]
             gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
-            now[member.name] = replace(member, confirmed=Confirmed(evidence, bar(lit), *gained))
+            evidence, needed = own[member.name]
+            now[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained))
         return [now.get(m.name, m) for m in settled], scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
@@ -529,9 +531,14 @@ class Loop:
         """Nats of own evidence that a term needs beside a fine scene, if it acts where its light falls."""
         return self._bar(self._misfit(fit), 1.0)
 
-    def _bar(self, misfit: float, lit: float) -> float:
-        """Nats that a term needs, of whose information ``lit`` lies where the scene's light falls."""
-        return self.least + self.settings.share * lit * misfit
+    def _bar(self, misfit: float, lit: float, lost: float = 0.0) -> float:
+        """Nats that a term needs, of whose information ``lit`` lies where the scene's light falls.
+
+        Without the others it would have ``lost`` more. What these do follows their equations as nearly as a
+        real cause does, and what is left of it looks like the term.
+        """
+        s = self.settings
+        return self.least + s.share * lit * misfit + s.form * lost
 
     def settled(self, member: Member) -> Member:
         """A member with what its rivals are worth in its place.

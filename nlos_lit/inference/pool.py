@@ -267,7 +267,7 @@ def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:
 
 
 def own_evidence(
-    fit: SurfelFit, split: Split, most: int, seed: int, names: list[str], bar: Callable[[float], float]
+    fit: SurfelFit, split: Split, most: int, seed: int, names: list[str], bar: Callable[[float, float], float]
 ) -> tuple[dict[str, tuple[float, float]], list[str]]:
     """How much the counts ask for each of several terms that a fit has, beside all else that it may do.
 
@@ -281,10 +281,11 @@ def own_evidence(
         most: fitted spots that are looked at.
         seed: of their choice.
         names: of the terms.
-        bar: nats that a term needs, from how far a misfit may look like it, see :class:`Candidate`.
+        bar: nats that a term needs, from how far a misfit may look like it, see :class:`Candidate`, and from
+            the nats that it would have more if the others were not there.
 
     Returns:
-        nats and ``lit``, as of a candidate, by name; and who is left.
+        nats that each has, and those that it needs, by name; and who is left.
     """
     problem, block = _problem(fit, split, most, seed, with_effects=False)
     whole = Projector(problem)
@@ -312,19 +313,24 @@ def own_evidence(
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit
 
+    @cache
+    def judged(name: str, gone: tuple[str, ...]) -> tuple[float, float]:
+        (nats, lit), others = one(name, gone), tuple(n for n in names if n != name and n in laws)
+        return nats, bar(lit, max(0.0, one(name, others)[0] - nats))
+
     def left(asked: list[str], gone: tuple[str, ...]) -> list[str]:
-        now = {n: one(n, gone) for n in asked}
-        while short := [n for n, (nats, lit) in now.items() if nats <= bar(lit)]:
-            worst = min(short, key=lambda n: now[n][0] / bar(now[n][1]))
+        now = {n: judged(n, gone) for n in asked}
+        while short := [n for n, (nats, needed) in now.items() if nats <= needed]:
+            worst = min(short, key=lambda n: now[n][0] / now[n][1])
             del now[worst]
             gone = (*gone, worst)
-            now |= {n: one(n, gone) for n in short if n in now}
+            now |= {n: judged(n, gone) for n in short if n in now}
         return list(now)
 
     free = [n for n in names if n in FREE_NAMES]
     enough = left([n for n in names if n not in free], tuple(free))
     enough += left(free, tuple(n for n in names if n not in free and n not in enough))
-    return {name: one(name, ()) for name in names}, enough
+    return {name: judged(name, ()) for name in names}, enough
 
 
 def _above_null(effect: Effect) -> Tensor:

@@ -19,9 +19,9 @@ from torch import Tensor
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import level_of
-from nlos_lit.functional.surfel_lattice import ring
+from nlos_lit.functional.surfel_lattice import flank, ring
 from nlos_lit.functional.surfel_paths import spline_matrix
-from nlos_lit.surfels.growth import within_depths
+from nlos_lit.surfels.growth import APART, best_apart, occupied, within_depths
 from nlos_lit.surfels.model import SurfelModel
 
 RINGS = 2  # cells by which sheets are extended at a time
@@ -34,9 +34,10 @@ CHUNK = 1 << 20  # paths at a time
 
 @torch.no_grad()
 def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
-    """Go on with all sheets by ``RINGS`` rings of cells, within the grid's depths.
+    """Go on with all sheets by ``RINGS`` rings of cells, and down their flanks, within the grid's depths.
 
-    They hide nothing, and are hidden by what is there.
+    They hide nothing, and are hidden by what is there. Flanks go on from surfels that are there, since only
+    their curvature is known.
 
     Args:
         model: whose surfels get more neighbours.
@@ -44,21 +45,30 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         spots: ``[B]`` rows of the capture for which it is found out who is hidden.
     """
     origin = torch.tensor(model.lateral.origin, device=model.anchor.device)
-    own, present = model.albedo(), len(model)
-    (centre, normal), albedo = model.placed(), own
+    own, present, apart = model.albedo(), len(model), APART * float(model.cell.max())
+    (centre, normal), albedo, curvature = model.placed(), own, model.curvature
+    down, falling, which = flank(centre, normal, curvature, own > SOURCE * own.mean(), model.cell)
+    chosen = best_apart(down, own[which], apart)
+    chosen = chosen[~occupied(down[chosen], centre, apart)]
     for _ in range(RINGS):
         more = ring(centre, normal, albedo, albedo > SOURCE * own.mean(), origin, model.cell)
-        inside = within_depths(more[0], grid)
         centre, normal, albedo = (
-            torch.cat([old, new[inside]]) for old, new in zip((centre, normal, albedo), more, strict=True)
+            torch.cat([old, new]) for old, new in zip((centre, normal, albedo), more, strict=True)
         )
+    flat = curvature.new_zeros(len(centre) - present, 3, 3)
+    centre, normal = torch.cat([centre, down[chosen]]), torch.cat([normal, falling[chosen]])
+    albedo = torch.cat([albedo, own[which[chosen]]])
+    curvature = torch.cat([curvature, flat, curvature[which[chosen]]])
+    inside = within_depths(centre, grid)
+    inside[:present] = True
+    centre, normal, albedo, curvature = (part[inside] for part in (centre, normal, albedo, curvature))
     hiders = model.hiders
     if len(hiders):
         new = hiders.new_zeros(*hiders.shape[:2], len(centre) - present, hiders.shape[3])
         new[:, spots] = model.hidden_by(spots, model.points_of(centre[present:], normal[present:]))
         hiders = torch.cat([hiders, new], 2)
     opacity = torch.cat([model.opacity(), own.new_zeros(len(centre) - present)])
-    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity, model.curvature)
+    model.place(centre, normal, torch.cat([own, BEGIN * albedo[present:]]), opacity, curvature)
     if len(hiders):
         model.hiders = hiders
 

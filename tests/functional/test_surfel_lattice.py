@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nlos_lit.functional.surfel_lattice import LAYER, TAKEN, ring
+from nlos_lit.functional.surfel_lattice import BACK, LAYER, TAKEN, flank, ring
 
 UP = torch.tensor([0.0, 0.0, -1.0])
 ORIGIN, CELL = torch.zeros(2), torch.tensor([0.1, 0.1])
@@ -107,3 +107,43 @@ def test_dark_surfels_have_little_say_in_where_a_sheet_lies_and_steep_ones_take_
     both = around(centre, torch.cat([UP[None], steep]))
     assert torch.allclose(both[0][:, 2], torch.ones(8))
     assert len(around(centre[1:], steep)[0]) == 0
+
+
+def of_cylinder(
+    degrees: list[float], radius: float = 0.15
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Places, normals and curvatures on an upright cylinder behind the wall, by their angle to the z axis."""
+    angle = torch.deg2rad(torch.tensor(degrees))
+    normal = torch.stack([angle.sin(), 0 * angle, -angle.cos()], 1)
+    along = torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
+    at = torch.tensor([0.1, 0.0, 0.8]) + radius * normal
+    return at, normal, along[:, :, None] * along[:, None] / radius
+
+
+def test_flanks_go_on_where_the_next_patch_is_steep():
+    """The last surfel before 66° goes on, one at 30° does not: the next lateral cell is as good. Going on
+    from what was begun leads round the cylinder, and ends where its back faces away from the wall.
+    """
+    cell, radius = torch.tensor([0.03, 0.03]), 0.15
+    at, normal, curvature = of_cylinder([-30.0, 30.0, 60.0])
+    found, reached = [], [60.0]
+    source = torch.ones(3, dtype=torch.bool)
+    while len(at):
+        at, normal, which = flank(at, normal, curvature, source, cell)
+        curvature, source = curvature[which], source[which]
+        found.append(len(at))
+        if len(at):
+            reached.append(float(torch.rad2deg(torch.atan2(normal[0, 0], -normal[0, 2]))))
+            away = (at[0] - torch.tensor([0.1, 0.0, 0.8])).norm()
+            assert abs(float(away) - radius) < 0.012  # the sagitta of so long a patch is 0.005
+    assert found == [1] * (len(reached) - 1) + [0]
+    assert reached[-1] < 90 + math.degrees(math.asin(BACK))
+    assert reached == sorted(reached)
+    assert reached[-1] > 85
+
+
+def test_flat_sheets_have_no_flanks_however_they_lean():
+    at, normal, curvature = of_cylinder([0.0, 50.0, 65.0])
+    source, cell = torch.ones(3, dtype=torch.bool), torch.tensor([0.03, 0.03])
+    assert len(flank(at, normal, 0 * curvature, source, cell)[0]) == 0
+    assert len(flank(at, normal, curvature, ~source, cell)[0]) == 0

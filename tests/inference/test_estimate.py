@@ -319,8 +319,8 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
     found, measured, split, _ = findings
     fit = fit_of(found.final.model, measured, found.final.extension, split.fit)
     names = ["irf_tail", "free_wall"]
-    asked, left = own_evidence(fit, split, 48, 3, names, lambda lit: -math.inf)
-    assert left == names
+    asked, _ = own_evidence(fit, split, 48, 3, names, lambda lit, lost: lit)
+    assert own_evidence(fit, split, 48, 3, names, lambda lit, lost: -math.inf)[1] == names
     rows = pool.tested_rows(fit, split, 48, 3)
     spots, block = torch.from_numpy(split.fit[rows]), torch.from_numpy(split.block[split.fit[rows]])
     for effect in fit.extension.effects:
@@ -345,20 +345,23 @@ def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
     tail, free = effect_of("irf_tail", scan, fraction=0.2), effect_of("free_time", scan)
     fit = fit_of(found.final.model, measured, Extension([tail, free]), split.fit)
     names = ["irf_tail", "free_time"]
-    both, _ = own_evidence(fit, split, 48, 3, names, lambda lit: -math.inf)
+    both, _ = own_evidence(fit, split, 48, 3, names, lambda lit, lost: 1 + lost)
     alone, _ = own_evidence(
         fit_of(found.final.model, measured, Extension([tail]), split.fit),
         split,
         48,
         3,
         ["irf_tail"],
-        lambda lit: -math.inf,
+        lambda lit, lost: 1 + lost,
     )
+    assert both["irf_tail"][1] == pytest.approx(1 + alone["irf_tail"][0] - both["irf_tail"][0], rel=0.02)
+    assert alone["irf_tail"][1] == 1
     bar = (both["irf_tail"][0] + alone["irf_tail"][0]) / 2
-    asked, left = own_evidence(fit, split, 48, 3, names, lambda lit: bar)
-    assert (asked, left) == (both, ["irf_tail"])
+    asked, left = own_evidence(fit, split, 48, 3, names, lambda lit, lost: bar)
+    assert left == ["irf_tail"]
+    assert all(asked[n] == (both[n][0], bar) for n in names)
     assert both["irf_tail"][0] < bar < alone["irf_tail"][0]
-    assert own_evidence(fit, split, 48, 3, names, lambda lit: 2 * alone["irf_tail"][0])[1] == []
+    assert own_evidence(fit, split, 48, 3, names, lambda lit, lost: 2 * alone["irf_tail"][0])[1] == []
 
 
 @FORWARD_MODE

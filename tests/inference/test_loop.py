@@ -101,9 +101,10 @@ class World:
         impossible: tuple[str, ...] = (),
         misfit: float = 0.0,
         taken_up: float = 0.0,
+        lost: dict[str, float] | None = None,
     ) -> None:
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
-        self.beside, self.rivals = beside or {}, rivals or {}
+        self.beside, self.rivals, self.lost = beside or {}, rivals or {}, lost or {}
         self.rebuilt: list[tuple[frozenset[str], int]] = []
         self.grown: list[frozenset[str]] = []
         self.asked: list[list[str]] = []
@@ -141,7 +142,8 @@ class World:
         found = {c.name: c for c in self.pool}
         own = {n: (self.own.get(n, 300.0), found[n].lit if n in found else 1.0) for n in names}
         own |= {n: (found[n].evidence, found[n].lit) for n in names if n in found and n not in self.own}
-        return own, [n for n, (nats, lit) in own.items() if nats > bar(lit)]
+        own = {n: (nats, bar(lit, self.lost.get(n, 0.0))) for n, (nats, lit) in own.items()}
+        return own, [n for n, (nats, needed) in own.items() if nats > needed]
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
         fit = FakeFit(extension, seed, anew=True)
@@ -354,6 +356,18 @@ def test_a_term_alone_holds_by_its_own_evidence(monkeypatch, more, accepted):
         assert found["irf_tail"].accepted is accepted
         assert found["irf_tail"].confirmed.needed == pytest.approx(bar)
         assert scene.names == ({"irf_tail"} if accepted else set())
+
+
+@pytest.mark.parametrize(("more", "accepted"), [(0.1, True), (-0.1, False)])
+def test_what_another_term_took_counts_against_its_look_alike(monkeypatch, more, accepted):
+    """A twentieth of the 2000 nats that it would have by itself: it may be what the other one gets wrong."""
+    pool, own = [candidate("irf_tail"), candidate("ghost_pulse")], {"ghost_pulse": LEAST + 100 + more}
+    table = {"irf_tail": nats(1000.0), "ghost_pulse": nats(50.0)}
+    found, _ = World(monkeypatch, table, pool, own, lost={"ghost_pulse": 2000.0}).hold(
+        "irf_tail", "ghost_pulse"
+    )
+    assert found["ghost_pulse"].confirmed.needed == pytest.approx(LEAST + 100)
+    assert (found["irf_tail"].accepted, found["ghost_pulse"].accepted) == (True, accepted)
 
 
 @pytest.mark.parametrize(("errors", "accepted"), [(-0.5, False), (0.5, True)])

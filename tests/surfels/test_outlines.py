@@ -14,6 +14,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import level_of
+from nlos_lit.functional.surfel_paths import STEEP
 from nlos_lit.surfels.fit import FINEST, Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.model import SurfelModel
 from nlos_lit.surfels.outlines import DIM, RINGS, SEARCH, cut_back, extend, solve_albedos
@@ -145,6 +146,26 @@ def test_rings_lie_within_the_grid_hide_nothing_and_are_hidden():
     model = board(torch.ones(3, 3), z=0.45)
     extend(model, shallow, SPOTS)
     assert len(model) == 9
+
+
+def test_round_sheets_go_on_down_their_flanks():
+    """From surfels that are there, not from those that are only tried; they curve on and hide nothing."""
+    model, radius = board(torch.ones(1, 3)), 0.5
+    angle = torch.deg2rad(torch.tensor([20.0, 40.0, 60.0]))
+    normal = torch.stack([angle.sin(), 0 * angle, -angle.cos()], 1)
+    along = torch.stack([angle.cos(), 0 * angle, angle.sin()], 1)
+    axis = torch.tensor([-0.4, 0.0, 1.0])
+    bend = along[:, :, None] * along[:, None] / radius
+    for curvature, more in ((bend, 1), (0 * bend, 0)):
+        model.place(axis + radius * normal, normal, torch.ones(3), torch.full((3,), 0.8), curvature)
+        extend(model, DEEP, SPOTS)
+        steep = -model.normal().detach()[3:, 2] < STEEP
+        assert int(steep.sum()) == more
+        assert model.opacity()[3:].max() < 1e-6
+        if more:
+            assert torch.equal(model.curvature[3:][steep], bend[2:])
+            away = (model.centre().detach()[3:][steep] - axis)[0, [0, 2]].norm()
+            assert abs(float(away) - radius) < 0.02
 
 
 def test_faint_surfels_are_not_extended():
