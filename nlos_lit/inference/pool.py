@@ -297,7 +297,8 @@ def own_evidence(
     does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
     @cache
-    def one(name: str, gone: tuple[str, ...]) -> tuple[float, float]:
+    def one(name: str, gone: tuple[str, ...]) -> tuple[float, float, float]:
+        """Nats, ``lit``, and nats if all of the scatter were the term's own."""
         effect, others = effects[name], [n for n in laws if n != name and n not in gone]
         many, at = math.log(len(effect.shape_grid())), above[name]
         residual = whole.left[:, 0] + sum((does[n] for n in gone if n in does), torch.zeros(()))
@@ -307,16 +308,18 @@ def own_evidence(
             column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
             beside = whole.beside(z, precision, residual)
             score, information, _ = _scores(problem, beside, effect, column, at[problem.spots])
-            return best_width(score, information, sparse(effect))[0] - many, _lit(problem, effect, column)
+            nats = best_width(score, information, sparse(effect))[0] - many
+            return nats, _lit(problem, effect, column), nats
         beside = whole.beside(z, precision, residual + does[name])
         own = (columns[name][:, : len(at)], beside.freed(freed[name][:, : len(at)]))
         found = _evidence(problem, beside, effect, *own, block)
-        return found.nats - many, found.lit
+        return found.nats - many, found.lit, found.loud - many
 
     @cache
     def judged(name: str, gone: tuple[str, ...]) -> tuple[float, float]:
-        (nats, lit), others = one(name, gone), tuple(n for n in names if n != name and n in laws)
-        return nats, bar(lit, max(0.0, one(name, others)[0] - nats))
+        (nats, lit, _), others = one(name, gone), tuple(n for n in laws if n != name and n in names)
+        # What the others do scatters like a misfit where a look-alike has to stand for it.
+        return nats, bar(lit, max(0.0, one(name, others)[2] - nats) if others else 0.0)
 
     def left(asked: list[str], gone: tuple[str, ...]) -> list[str]:
         now = {n: judged(n, gone) for n in asked}

@@ -354,7 +354,8 @@ def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
         ["irf_tail"],
         lambda lit, lost: 1 + lost,
     )
-    assert both["irf_tail"][1] == pytest.approx(1 + alone["irf_tail"][0] - both["irf_tail"][0], rel=0.02)
+    # Its scatter beside nothing counts as its own.
+    assert both["irf_tail"][1] > 0.98 * (1 + alone["irf_tail"][0] - both["irf_tail"][0])
     assert alone["irf_tail"][1] == 1
     bar = (both["irf_tail"][0] + alone["irf_tail"][0]) / 2
     asked, left = own_evidence(fit, split, 48, 3, names, lambda lit, lost: bar)
