@@ -64,7 +64,7 @@ class CriticismSettings:
     spots: int = 1024
     level: float = 0.01
     share: float = 0.1
-    form: float = 0.05
+    form: float = 0.25
     most: int = 8
     rivals: int = 2
     open_share: float = 0.05

@@ -360,13 +360,13 @@ def test_a_term_alone_holds_by_its_own_evidence(monkeypatch, more, accepted):
 
 @pytest.mark.parametrize(("more", "accepted"), [(0.1, True), (-0.1, False)])
 def test_what_another_term_took_counts_against_its_look_alike(monkeypatch, more, accepted):
-    """A twentieth of the 2000 nats that it would have by itself: it may be what the other one gets wrong."""
-    pool, own = [candidate("irf_tail"), candidate("ghost_pulse")], {"ghost_pulse": LEAST + 100 + more}
+    """A quarter of the 2000 nats that it would have by itself: it may be what the other one gets wrong."""
+    pool, own = [candidate("irf_tail"), candidate("ghost_pulse")], {"ghost_pulse": LEAST + 500 + more}
     table = {"irf_tail": nats(1000.0), "ghost_pulse": nats(50.0)}
     found, _ = World(monkeypatch, table, pool, own, lost={"ghost_pulse": 2000.0}).hold(
         "irf_tail", "ghost_pulse"
     )
-    assert found["ghost_pulse"].confirmed.needed == pytest.approx(LEAST + 100)
+    assert found["ghost_pulse"].confirmed.needed == pytest.approx(LEAST + 500)
     assert (found["irf_tail"].accepted, found["ghost_pulse"].accepted) == (True, accepted)
 
 
