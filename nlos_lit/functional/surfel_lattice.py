@@ -13,7 +13,7 @@ LAYER = 1.2  # cells along z between two sheets
 TAKEN = 0.55  # cells along x and y within which a surfel has a cell: its own, and nearly no other's
 FAINT = 0.03  # of the mean albedo, from which on a surfel has its whole say in where the sheet lies
 BACK = 0.35  # cosine by which flanks may face away from the wall: its far side sees them
-TURN = 0.6  # rad from one patch of a flank to the next, at most: beyond it patches are too long for it
+TURN = 0.4  # rad from one patch of a flank to the next, at most: beyond it patches are too long for it
 CHUNK = 1 << 22  # pairs of places and surfels at a time
 
 
@@ -106,15 +106,15 @@ def flank(
         centres and normals of those that are steep, and which surfel each goes on from.
 
     Examples:
-        A cylinder of radius 0.1 along y, from a surfel that leans by 60°:
+        A cylinder of radius 0.2 along y, from a surfel that leans by 60°:
 
         >>> leaning = torch.tensor([[0.75**0.5, 0.0, -0.5]])
         >>> along = torch.tensor([[0.5, 0.0, 0.75**0.5]])
-        >>> bend = along[:, :, None] * along[:, None] / 0.1
+        >>> bend = along[:, :, None] * along[:, None] / 0.2
         >>> both = torch.ones(1, dtype=torch.bool), torch.tensor([0.02, 0.02])
-        >>> place, facing, _ = flank(0.1 * leaning, leaning, bend, *both)
+        >>> place, facing, _ = flank(0.2 * leaning, leaning, bend, *both)
         >>> round(float(place.norm()), 3), round(float(facing[0, 2]), 2)
-        (0.101, -0.1)
+        (0.2, -0.3)
     """
     down = torch.tensor([0.0, 0.0, 1.0], device=centre.device) - normal[:, 2:] * normal
     leans = down.norm(dim=1, keepdim=True)
