@@ -166,8 +166,8 @@ def trace(
         # Where a patch covers its lateral cell, what leans more has more area.
         leans = (-facing[..., 2]).clamp_min(STEEP)
         share = share * (-normal[:, 2:]).clamp_min(STEEP) / leans
-    # Near the middle of the wall, so that differences of squares keep their digits.
-    middle = laser.mean(0)
+    # From the middle of the scene, so that differences of squares keep their digits, in any batch the same.
+    middle = centre.detach().mean(0)
     points = centre[:, None] + shift - middle
     factor, leg, cosine = _leg(points, facing, laser - middle, laser_normal)
     if confocal:

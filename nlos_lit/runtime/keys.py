@@ -154,6 +154,7 @@ CRITICISM: dict[str, Rule] = {
     "spots": whole(1, 10_000_000),
     "level": _fraction,
     "share": number(0, 1),
+    "form": number(0, 1),
     "rivals": whole(0, 1000),
     "open_share": number(0, 1),
     "odds": number(0, 1),
