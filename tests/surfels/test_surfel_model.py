@@ -135,7 +135,7 @@ def test_the_splat_as_a_matrix_is_the_splat():
 
 
 def test_legs_keep_their_digits_far_from_the_origin():
-    """Products of matrices lose what squares have in common; the wall's middle has little in common."""
+    """Products of matrices lose what squares have in common; from the scene's middle that is little."""
     model, spots = random_model()
     with torch.no_grad():
         near = model.paths(spots)
