@@ -1,4 +1,4 @@
-"""Light paths over flat surface elements (surfels): throughput, length, and how they fill time bins.
+"""Light paths over surface elements (surfels): throughput, length, and how they fill time bins.
 
 A surfel is a patch over a lateral cell, given by its centre, normal and curvature. Its path from the laser's
 wall point over the surfel to the sensor's carries (paper Eq. 6-7, unit wall reflectance and albedo)

@@ -104,12 +104,13 @@ def who_hides(
 
 
 def _seen_from(height: Tensor, points: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
-    """What pictures from wall points of one height have in common: ``[3, P]``, from which :func:`_columns`
+    """What pictures from wall points of one height have in common: ``[2, 3, P]``, from which :func:`_columns`
     are, and depths ``[P]`` in steps.
     """
     depth = (points[:, 2] - height).clamp_min(1e-3)
     scale = 1 / (depth * pixel)
-    return torch.stack([scale, points[:, 0] * scale, points[:, 1] * scale]), (depth * STEPS).long()
+    along = [torch.stack([scale, points[:, k] * scale, torch.ones_like(scale)]) for k in range(2)]
+    return torch.stack(along), (depth * STEPS).long()
 
 
 def _columns(wall: Tensor, seen: Tensor, left: Tensor | float, low: Tensor | float) -> tuple[Tensor, Tensor]:
@@ -117,9 +118,8 @@ def _columns(wall: Tensor, seen: Tensor, left: Tensor | float, low: Tensor | flo
     on ``[W, 1]``, as floats.
     """
     one = wall.new_ones(len(wall), 1)
-    places = torch.cat([seen, torch.ones_like(seen[:1])])
 
     def along(k: int, first: Tensor | float) -> Tensor:
-        return (torch.cat([-wall[:, k : k + 1], one, 0.5 - first * one], 1) @ places[[0, k + 1, 3]]).floor_()
+        return (torch.cat([-wall[:, k : k + 1], one, 0.5 - first * one], 1) @ seen[k]).floor_()
 
     return along(0, left), along(1, low)

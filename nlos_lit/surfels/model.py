@@ -316,12 +316,11 @@ class SurfelModel(nn.Module):
         Returns:
             ``[V, K, 3]`` m.
         """
-        shift, _ = spread(normal, self.cell, quadrature(self._points_apart(LOOKED, 2), self.cell.device))
+        shift, _ = spread(normal, self.cell, quadrature(self._along(LOOKED, 2), self.cell.device))
         return centre[:, None] + shift
 
-    def _points_apart(self, bins: float, most: int) -> int:
-        """Points along each side of a surfel that lie no more than so far apart."""
-        return min(most, max(1, math.ceil(float(self.cell.max()) / (bins * self.bin_length) - 1e-6)))
+    def _along(self, apart: float, most: int) -> int:
+        return points_along(float(self.cell.max()), self.bin_length, apart, most)
 
     @torch.no_grad()
     def hidden_by(self, spots: Tensor, places: Tensor) -> Tensor:
@@ -337,7 +336,7 @@ class SurfelModel(nn.Module):
         centre, normal = self.placed()
         drawn = torch.nonzero(self.opacity() > HIDING)[:, 0]
         number = torch.cat([drawn.new_zeros(1), drawn + 1]).to(torch.int32)
-        along = self._points_apart(DRAWN, 5)
+        along = self._along(DRAWN, 5)
 
         def found(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
@@ -610,12 +609,14 @@ def unknown_opacity(albedo: Tensor) -> Tensor:
     return UNKNOWN * (albedo / (WHOLE * albedo.mean()).clamp_min(1e-30)).clamp(0.02, 1.0)
 
 
-def points_along(cell: float, bin_length: float) -> int:
-    """Quadrature points along each side of a surfel: their arrivals are about two bins apart; at most 8.
+def points_along(cell: float, bin_length: float, apart: float = 1 / 0.55, most: int = 8) -> int:
+    """Points along each side of a surfel; those of its quadrature have arrivals about two bins apart.
 
     Args:
         cell: side of the surfel, m.
         bin_length: optical path of one bin, m.
+        apart: bins between points, at most …
+        most: … unless there would be more than so many.
 
     Returns:
         at least 1.
@@ -624,4 +625,4 @@ def points_along(cell: float, bin_length: float) -> int:
         >>> points_along(0.03, 0.0096), points_along(0.01, 0.0096)
         (2, 1)
     """
-    return min(8, max(1, math.ceil(cell * 0.55 / bin_length)))
+    return min(most, max(1, math.ceil(cell / (apart * bin_length) - 1e-6)))  # cells are single precision

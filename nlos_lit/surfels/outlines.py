@@ -86,9 +86,13 @@ class _Linear(NamedTuple):
         paths, albedo = model.paths(spots), model.albedo()
         energy, time = model.arrivals(paths, spots, hooks, torch.ones_like(albedo))
         splat = spline_matrix(energy, time, model.n_bins)
-        direct = torch.from_numpy(splat.T @ albedo.repeat(len(spots)).cpu().numpy()).to(albedo.device)
-        direct = direct.view(len(spots), -1)
+        direct = _arriving(splat, albedo.cpu().numpy(), len(spots)).to(albedo.device)
         return cls(spots, splat, hooks.transients(direct, energy * albedo[:, None], paths, spots) - direct)
+
+
+def _arriving(splat: csr_array, albedo: np.ndarray, number: int) -> Tensor:
+    """``[B, T]`` light of albedos ``[M]`` at a number B of spots."""
+    return torch.from_numpy(splat.T @ np.tile(albedo, number)).view(number, -1)
 
 
 def solve_albedos(
@@ -126,8 +130,7 @@ def solve_albedos(
         total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0].double().cpu().numpy()
         sent = (level * levels).astype(np.float32)
         for (part, splat, other), seen in zip(parts, counts.split(size), strict=True):
-            direct = torch.from_numpy(splat.T @ np.tile(sent, len(part))).view(other.shape).to(device)
-            arriving = (direct + other).requires_grad_()
+            arriving = (_arriving(splat, sent, len(part)).to(device) + other).requires_grad_()
             expected = model.record(arriving, part, hooks)[:, first:].clamp_min(1e-9).double()
             nats = (expected - seen - torch.xlogy(seen.double(), expected / seen.clamp_min(1))).sum()
             pull = torch.autograd.grad(nats, arriving)[0].reshape(-1).cpu().numpy()
