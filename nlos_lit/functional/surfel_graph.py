@@ -18,6 +18,7 @@ EDGE = 0.3  # of the scene's level: differences of albedo beyond it are edges, a
 ALIKE = 0.05  # … below it are none, and cost next to nothing
 LEVEL = 0.75  # of the light comes from surfels no brighter than the scene's own level
 CURVED = 1.0  # rad by which a surfel turns from one side to the other, at most
+THERE = 0.1  # of the level: at so little albedo a surfel has half of what it costs to be there
 BRIGHT = 0.2  # deviation of ln(albedo) above that level
 
 
@@ -361,3 +362,24 @@ def brightness(albedo: Tensor, level: Tensor) -> Tensor:
     """
     over = torch.log((albedo / level).clamp_min(1.0))
     return ((over / BRIGHT) ** 2).sum() / 2
+
+
+def presence(albedo: Tensor, level: Tensor) -> Tensor:
+    """How many surfels are there: ``Σ ρ/(ρ + THERE·level)``.
+
+    A surfel that is there costs the same however bright it is, so that what many faint ones would explain
+    together stays unexplained, unless it is worth so much.
+
+    Args:
+        albedo: ``[M]`` ≥ 0.
+        level: of the scene, from :func:`level_of`.
+
+    Returns:
+        A scalar, differentiable.
+
+    Examples:
+        >>> import torch
+        >>> presence(torch.tensor([0.0, 0.1, 0.9]), torch.tensor(1.0))
+        tensor(1.4000)
+    """
+    return (albedo / (albedo + THERE * level)).sum()

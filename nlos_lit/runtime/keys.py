@@ -146,6 +146,7 @@ SURFELS: dict[str, Rule] = {
     "bending": _weight,
     "evenness": _weight,
     "brightness": _weight,
+    "lean": number(0, 1e6, "nats"),
     "surfel_cost": number(0, 1e6, "nats"),
     "test_spots": whole(1, 10_000_000, "spots"),
     "visibility": FLAG,

@@ -25,7 +25,20 @@ from nlos_lit.surfels.model import SurfelModel, points_along, unknown_opacity
 from nlos_lit.surfels.outlines import MEND, SEARCH, cut_back, extend, solve_albedos
 
 Progress = Callable[[int, int], None]
-PLAIN = ("order", "place", "tested", "done", "more", "bodies", "before", "undo", "finer", "history", "losses")
+PLAIN = (
+    "order",
+    "place",
+    "tested",
+    "done",
+    "more",
+    "bodies",
+    "before",
+    "undo",
+    "finer",
+    "lean",
+    "history",
+    "losses",
+)
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
@@ -57,6 +70,8 @@ class SurfelSettings:
             it for the logarithm of a prior.
         evenness: weight against albedos that differ between neighbours …
         brightness: … or are beyond the scene's own level (:meth:`SurfelModel.albedo_cost`).
+        lean: nats that each surfel costs that is there, however faint, while sheets find their outlines;
+            nothing any more when rounds follow that are judged by what they predict.
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
@@ -84,6 +99,7 @@ class SurfelSettings:
     bending: float = 0.5
     evenness: float = 0.7
     brightness: float = 1.0
+    lean: float = 3.0
     surfel_cost: float = 1.5
     test_spots: int = 384
     visibility: bool = True
@@ -91,12 +107,13 @@ class SurfelSettings:
     def __post_init__(self) -> None:
         if min(self.rounds, self.steps, self.batch, self.per_cell, self.test_spots) < 1:
             raise UserError("surfels.rounds, steps, batch, per_cell and test_spots must be at least 1")
-        weights = (self.bending, self.evenness, self.brightness, self.surfel_cost)
+        weights = (self.bending, self.evenness, self.brightness, self.lean, self.surfel_cost)
         least = min(self.contest, self.outlines, self.more, *weights)
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
                 "surfels.floor must lie between 0 and 1, and surfels.contest, outlines, more, bending, "
-                f"evenness, brightness and surfel_cost be 0 or more; found floor={self.floor} and {least}"
+                f"evenness, brightness, lean and surfel_cost be 0 or more; found "
+                f"floor={self.floor} and {least}"
             )
 
 
@@ -215,6 +232,7 @@ class SurfelFit:
         self.more, self.bodies = 0, 0  # rounds that may follow, and those before which bodies are begun
         self.before = torch.zeros(0)  # nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
+        self.lean = True  # no round was judged yet: surfels cost something
         self.finer = True  # surfels may be divided before one of them
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []
@@ -234,7 +252,9 @@ class SurfelFit:
         generator = torch.Generator().manual_seed(seed)
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
         order = torch.randperm(len(self.train), generator=generator)
-        return SurfelFit(model, *parts, extension, generator, order, self.judged)
+        other = SurfelFit(model, *parts, extension, generator, order, self.judged)
+        other.lean = self.lean
+        return other
 
     def parts(self) -> dict[str, Any]:
         """All that the fit is made of, for :meth:`of_parts`, which goes on from there to the last digit."""
@@ -390,6 +410,7 @@ class SurfelFit:
             s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
             divide = self.finer and wide and 4 * len(self.model) <= s.most
             parts = 2 if divide else 1
+        self.lean = False
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
         self.before, self.undo = nats, undo
 
@@ -460,13 +481,12 @@ class SurfelFit:
             self.model.set_opacity(unknown_opacity(self.model.albedo().detach()))
         self._hide(now.outline)
         if now.outline:
-            prior = (s.evenness, s.brightness)
             before = self.model.albedo().detach()
             extend(self.model, self.grid, spots)
-            solve_albedos(self.model, spots, counts, *prior, SEARCH, self.extension)
+            solve_albedos(self.model, spots, counts, self._albedo_weights(), SEARCH, self.extension)
             cut_back(self.model, before)
             self._hide()
-            solve_albedos(self.model, spots, counts, *prior, MEND, self.extension)
+            solve_albedos(self.model, spots, counts, self._albedo_weights(), MEND, self.extension)
 
     def _hide(self, tested_only: bool = False) -> None:
         """Who hides whom; with ``tested_only`` for the tested spots: the others see all until then."""
@@ -535,10 +555,15 @@ class SurfelFit:
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
             "bending": s.bending * per_count * model.bending(placed),
-            "albedos": per_count * model.albedo_cost(s.evenness, s.brightness),
+            "albedos": per_count * model.albedo_cost(*self._albedo_weights()),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
         return {"loss": sum(terms.values(), torch.zeros(())), **terms}
+
+    def _albedo_weights(self) -> tuple[float, float, float]:
+        """Of what albedos cost in the present round."""
+        s, outlined = self.settings, any(now.outline or now.onward for now in self.plan[:1])
+        return s.evenness, s.brightness, s.lean if self.lean and outlined else 0.0
 
     def step(self) -> None:
         """One batch."""

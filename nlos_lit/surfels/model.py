@@ -22,6 +22,7 @@ from nlos_lit.functional.surfel_graph import (
     lay_sheet,
     level_of,
     neighbour_pairs,
+    presence,
     sheet_normals,
 )
 from nlos_lit.functional.surfel_paths import (
@@ -270,12 +271,15 @@ class SurfelModel(nn.Module):
         """
         return bending(*placed, self.trust(), self.pairs)
 
-    def albedo_cost(self, evenness: float, bright: float, albedo: Tensor | None = None) -> Tensor:
-        """What albedos cost that differ between neighbours, or exceed the scene's own level.
+    def albedo_cost(
+        self, evenness: float, bright: float, there: float, albedo: Tensor | None = None
+    ) -> Tensor:
+        """What albedos cost that differ between neighbours, exceed the scene's own level, or are there.
 
         Args:
             evenness: weight of :func:`~nlos_lit.functional.surfel_graph.albedo_steps` …
-            bright: … and of :func:`~nlos_lit.functional.surfel_graph.brightness`.
+            bright: … of :func:`~nlos_lit.functional.surfel_graph.brightness` …
+            there: … and of :func:`~nlos_lit.functional.surfel_graph.presence`.
             albedo: ``[M]`` instead of the surfels' own, whose level stays.
 
         Returns:
@@ -283,7 +287,8 @@ class SurfelModel(nn.Module):
         """
         own = self.albedo()
         level, albedo = level_of(own), own if albedo is None else albedo
-        return evenness * albedo_steps(albedo, self.pairs, level) + bright * brightness(albedo, level)
+        steps = albedo_steps(albedo, self.pairs, level)
+        return evenness * steps + bright * brightness(albedo, level) + there * presence(albedo, level)
 
     def opacity(self) -> Tensor:
         """``[M]`` share of the light that a surfel keeps from what is behind it."""

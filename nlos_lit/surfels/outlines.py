@@ -99,8 +99,7 @@ def solve_albedos(
     model: SurfelModel,
     spots: Tensor,
     counts: Tensor,
-    evenness: float,
-    brightness: float,
+    weights: tuple[float, float, float],
     iterations: int,
     hooks: Hooks = NOTHING,
 ) -> None:
@@ -114,8 +113,8 @@ def solve_albedos(
         model: whose albedos are set, linked.
         spots: ``[B]`` rows of the capture.
         counts: ``[B, T_gate]`` of them.
-        evenness: weight of steps between neighbours …
-        brightness: … and of albedos above the scene's level.
+        weights: of steps between neighbours, of albedos above the scene's level, and of surfels that are
+            there.
         iterations: at most.
         hooks: effects, which stand still.
     """
@@ -126,7 +125,7 @@ def solve_albedos(
 
     def cost(levels: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.tensor(levels, dtype=torch.float32, device=device, requires_grad=True)
-        prior = model.albedo_cost(evenness, brightness, level * x)
+        prior = model.albedo_cost(*weights, level * x)
         total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0].double().cpu().numpy()
         sent = (level * levels).astype(np.float32)
         for (part, splat, other), seen in zip(parts, counts.split(size), strict=True):

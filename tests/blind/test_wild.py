@@ -331,7 +331,7 @@ def test_a_scene_takes_up_an_offset_but_no_jitter():
     assert 0 < shown["time_offset"].projected < 0.1 * shown["time_offset"].plain
     assert shown["jitter_heavy"].projected > 0.5 * shown["jitter_heavy"].plain
     basis = nuisances(truth)
-    number = (len(basis) - 5) // 4
+    number = (len(basis) - 5) // 6
     albedo = basis[:number].sum(axis=0)
     signal = truth.without - truth.dark
     assert albedo.sum() == pytest.approx(signal.sum(), rel=0.05)
@@ -347,12 +347,15 @@ def test_a_scene_that_lies_aside_takes_up_a_wrong_baseline():
 
 
 def test_moves_of_patches_are_those_of_a_scene_seen_anew():
-    """By about a bin, of a patch or of the whole scene along each axis: by the derivative, and rendered."""
+    """By about a bin, of a patch or of the whole scene along each axis, or leaning: by the derivative, and
+    rendered.
+    """
     truth = hide(Spec("letters", effects=("jitter_heavy",), strengths=(0,), level=2000, seed=6, side=SIDE))
     basis = nuisances(truth)
-    number = (len(basis) - 5) // 4
-    for k in (number + 3, 2 * number + 3, 3 * number + 3, 4 * number, 4 * number + 1, 4 * number + 2):
-        change, step = np.zeros(len(basis)), 0.3 if k < 4 * number else 0.03
+    number = (len(basis) - 5) // 6
+    one, whole = number * np.arange(1, 6) + 3, 6 * number + np.arange(3)
+    for k in (*one, *whole):
+        change, step = np.zeros(len(basis)), 0.3 if k < 6 * number else 0.03
         change[k] = step
         moved = (rendering(truth, change) - rendering(truth, -change)) / (2 * step)
         assert np.corrcoef(moved.ravel(), basis[k].ravel())[0, 1] > 0.96, k

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from blind_elements import Axis, Elements, third_bounce
+from blind_elements import Axis, Elements, Legs, third_bounce
 from blind_scenes import FINE, PAD
 from scipy.signal import fftconvolve
 from wild_scenes import WildScene
@@ -22,6 +22,7 @@ MOST = 10_000  # elements that make the patches
 ALBEDO = 1.0  # prior standard deviation of a patch's log albedo
 BINS = 3.0  # by which a patch may lie elsewhere along each of three axes, bins …
 WHOLE = 30.0  # … and the whole scene
+TILT = 0.3  # rad by which a patch may lean otherwise, about both axes across the line of sight
 WIDTH = 0.5  # of the response's logarithmic widths
 HALF = 2  # steps in a bin
 CLEAR = 100.0  # from which on an effect should be named
@@ -162,11 +163,13 @@ def profiled(with_: np.ndarray, without: np.ndarray) -> np.ndarray:
 
 
 def nuisances(truth: Truth, change: np.ndarray | None = None) -> np.ndarray:
-    """``[K, S, T]`` changes of counts by patches' albedos and places and the response's two widths.
+    """``[K, S, T]`` changes of counts by patches' albedos, places and tilts and the response's two widths.
 
     Each is for one prior standard deviation. Rendered patch by patch from the clean scene; a patch that
     moves delays its light at every spot by what its way grows. It moves away from the wall's middle and
-    aside, by itself and with all others: where a scene is must be fitted, in all three dimensions.
+    aside, by itself and with all others: where a scene is must be fitted, in all three dimensions. One that
+    leans turns about its own middle, so that it looks brighter from one side of the wall, and its parts
+    come sooner or later.
 
     Args:
         truth: of the capture.
@@ -176,19 +179,21 @@ def nuisances(truth: Truth, change: np.ndarray | None = None) -> np.ndarray:
     elements, seen, groups, widths = _changed(truth, change)
     kernel, first = response_kernel(*widths, scene.window.bin_length / HALF)
     factor = _factor(truth)
-    albedo, place, whole = [], [], np.zeros((3, len(scene.laser), scene.window.n_bins))
+    albedo, place, tilt, whole = [], [], [], np.zeros((3, len(scene.laser), scene.window.n_bins))
     for k in range(groups.max() + 1):
         mine = elements.of(groups == k)
-        light = factor * third_bounce(mine, scene.laser, scene.sensor, seen[:, groups == k], _axis(scene))
-        wide = _smeared(light, kernel, first)
+        given = (mine, scene.laser, scene.sensor, seen[:, groups == k], _axis(scene))
+        wide = _smeared(factor * third_bounce(*given), kernel, first)
         albedo.append(ALBEDO * _bins(wide))
         later = -BINS * _bins(_slope(wide))
         axes = _axes(scene, mine)
         place.append([later * growth[:, None] for growth in _growth(scene, mine, axes)])
+        tilt.append([TILT * _bins(_smeared(factor * _leaning(given, a), kernel, first)) for a in axes[1:]])
         for k, growth in enumerate(_growth(scene, mine, np.eye(3))):
             whole[k] += WHOLE / BINS * later * growth[:, None]
     total = np.sum(albedo, axis=0) / ALBEDO
     moves = [change for along in zip(*place, strict=True) for change in along]
+    moves += [change for about in zip(*tilt, strict=True) for change in about]
     return np.stack([*albedo, *moves, *whole, *_width_changes(scene, widths, total)]).astype(np.float32)
 
 
@@ -211,13 +216,20 @@ def _changed(
     if change is None:
         return elements, seen, groups, (sigma, 1 / decay)
     number = groups.max() + 1
-    lit, moves, whole, (wider, sharper) = np.split(change, [number, 4 * number, 4 * number + 3])
+    lit, moves, tilts, whole, (wider, sharper) = np.split(
+        change, [number, 4 * number, 6 * number, 6 * number + 3]
+    )
     axes = np.stack([_axes(scene, elements.of(groups == k)) for k in range(number)])
     way = BINS * np.einsum("jk,kjx->kx", moves.reshape(3, number), axes) + WHOLE * whole
-    moved = elements.centre + (scene.window.bin_length / 2 * way)[groups]
+    turn = TILT * np.einsum("jk,kjx->kx", tilts.reshape(2, number).clip(-3, 3), axes[:, 1:])[groups]
+    middle = np.stack([_middle(elements.of(groups == k)) for k in range(number)])[groups]
+    turned = elements.centre + np.cross(turn, elements.centre - middle)
+    normal = elements.normal + np.cross(turn, elements.normal)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    moved = turned + (scene.window.bin_length / 2 * way)[groups]
     bright = elements.albedo * np.exp(ALBEDO * lit.clip(-3, 3))[groups]
     limits = (sigma * np.exp(WIDTH * np.clip(wider, -3, 3)), np.exp(WIDTH * np.clip(sharper, -3, 3)) / decay)
-    return replace(elements, centre=moved, albedo=bright), seen, groups, limits
+    return replace(elements, centre=moved, normal=normal, albedo=bright), seen, groups, limits
 
 
 def _thinned(scene: WildScene) -> tuple[Elements, np.ndarray]:
@@ -288,9 +300,38 @@ def _bins(light: np.ndarray) -> np.ndarray:
     return light.reshape(len(light), -1, HALF).sum(axis=2)[:, PAD:-PAD]
 
 
+def _leaning(
+    given: tuple[Elements, np.ndarray, np.ndarray, np.ndarray, Axis], about: np.ndarray
+) -> np.ndarray:
+    """``[S, n]`` change of a patch's light a radian that it turns about an axis through its middle."""
+    mine = given[0]
+    lean = np.cross(about, mine.normal)
+    shift = np.cross(about, mine.centre - _middle(mine))
+
+    def brighter(legs: Legs) -> np.ndarray:
+        both = ((legs.to_laser, legs.cosine1), (legs.to_sensor, legs.cosine2))
+        return sum(np.divide(_along(u, lean), c, out=np.zeros_like(c), where=c > 1e-3) for u, c in both)
+
+    def longer(legs: Legs) -> np.ndarray:
+        return -_along(legs.to_laser, shift) - _along(legs.to_sensor, shift)
+
+    later = third_bounce(*given, weights=(longer,)) / (HALF * given[4].step)  # bins
+    return third_bounce(*given, weights=(brighter,)) - _slope(later)
+
+
+def _along(unit: tuple[np.ndarray, ...], vector: np.ndarray) -> np.ndarray:
+    """``[B, N]`` part of vectors ``[N, 3]`` along unit vectors, 3 × ``[B, N]``."""
+    return sum(u * v for u, v in zip(unit, vector.T, strict=True))
+
+
+def _middle(mine: Elements) -> np.ndarray:
+    """``[3]`` of a patch."""
+    return mine.area @ mine.centre / mine.area.sum()
+
+
 def _axes(scene: WildScene, mine: Elements) -> np.ndarray:
     """``[3, 3]`` unit vectors: from the wall's middle to a patch, and two across."""
-    centre = mine.area @ mine.centre / mine.area.sum()
+    centre = _middle(mine)
     middle = (scene.sensor.min(axis=0) + scene.sensor.max(axis=0)) / 2
     away = (centre - middle) / np.linalg.norm(centre - middle)
     across = np.cross(away, [0.0, 1.0, 0.0])
@@ -300,7 +341,7 @@ def _axes(scene: WildScene, mine: Elements) -> np.ndarray:
 
 def _growth(scene: WildScene, mine: Elements, axes: np.ndarray) -> np.ndarray:
     """``[3, S]`` growth of the path to a patch that moves along each axis by ½."""
-    centre = mine.area @ mine.centre / mine.area.sum()
+    centre = _middle(mine)
     legs = (centre - points for points in (scene.laser, scene.sensor))
     units = sum(leg / np.linalg.norm(leg, axis=1, keepdims=True) for leg in legs)
     return axes @ units.T / 2

@@ -42,13 +42,13 @@ def test_albedos_are_found_together_and_there_are_none_where_nothing_is():
     true[:, :2], true[0, 4] = 0.0, 0.0
     counts = board(true).expected(SPOTS)
     model = board(torch.full((5, 5), 0.5))
-    solve_albedos(model, SPOTS, counts, 0.0, 0.0, SEARCH)
+    solve_albedos(model, SPOTS, counts, (0.0, 0.0, 0.0), SEARCH)
     found = model.albedo().detach().view(5, 5)
     assert (found - true)[true == 1].abs().max() < 0.1
     assert found[true == 0].max() < 0.1
     noisy, errors = torch.poisson(counts, generator=torch.Generator().manual_seed(2)), []
     for evenness in (0.0, 0.7):
-        solve_albedos(model, SPOTS, noisy, evenness, 0.0, SEARCH)
+        solve_albedos(model, SPOTS, noisy, (evenness, 0.0, 0.0), SEARCH)
         errors.append((model.albedo().view(5, 5) - true).abs().mean().item())
     assert errors[1] < 0.7 * errors[0]
 
@@ -59,7 +59,7 @@ def test_the_solution_is_that_of_the_cost_it_names():
     counts = torch.poisson(board(true).expected(SPOTS), generator=torch.Generator().manual_seed(2))
     model = board(torch.full((5, 5), 0.6))
     for _ in range(4):  # as often as it stops, since the level may change
-        solve_albedos(model, SPOTS, counts, 0.7, 0.0, SEARCH)
+        solve_albedos(model, SPOTS, counts, (0.7, 0.0, 0.0), SEARCH)
     level = model.albedo().detach()
 
     def cost(albedo: Tensor) -> float:
@@ -67,7 +67,7 @@ def test_the_solution_is_that_of_the_cost_it_names():
         expected = model.record(model.transients(paths, SPOTS, Extension([]), albedo), SPOTS, Extension([]))
         expected = expected[:, model.gate[0] :].double()
         nats = (expected - torch.xlogy(counts.double(), expected)).sum()
-        return float(nats + model.albedo_cost(0.7, 0.0, albedo))
+        return float(nats + model.albedo_cost(0.7, 0.0, 0.0, albedo))
 
     with torch.no_grad():
         least = cost(level)
@@ -78,6 +78,26 @@ def test_the_solution_is_that_of_the_cost_it_names():
                 assert cost(moved) > least
 
 
+@pytest.mark.parametrize(("cost", "stays"), [(0.5, True), (4.0, False)])
+def test_a_faint_surfel_must_be_worth_what_it_costs(cost, stays):
+    """``cost`` of what the counts lose without it; the sheet, each of whose surfels is worth more, stays."""
+    model = board(torch.ones(3, 3))
+    centre = torch.cat([model.centre().detach(), torch.tensor([[0.5, 0.5, 0.8]])])
+    normal = torch.tensor([0.0, 0.0, -1.0]).expand(10, 3)
+    model.place(centre, normal, torch.cat([torch.ones(9), torch.tensor([0.3])]))
+    with torch.no_grad():
+        counts = model.expected(SPOTS).double()
+        model.set_albedo(torch.cat([torch.ones(9), torch.zeros(1)]))
+        without = model.expected(SPOTS).double()
+        model.set_albedo(torch.cat([torch.ones(9), torch.tensor([0.3])]))
+    worth = float((without - counts - torch.xlogy(counts, without / counts)).sum())
+    assert worth > 3
+    solve_albedos(model, SPOTS, counts.float(), (0.7, 1.0, cost * worth), SEARCH)
+    albedo = model.albedo().detach()
+    assert albedo[:9].min() > 0.5
+    assert (albedo[9] > DIM) == stays
+
+
 def test_a_spot_counts_once():
     """Of few spots the prior says more: their noise must not say what they leave open."""
     counts = torch.poisson(
@@ -86,7 +106,7 @@ def test_a_spot_counts_once():
     rough = {}
     for few in (10, 100):
         model = board(torch.ones(5, 5))
-        solve_albedos(model, SPOTS[:few], counts[:few], 30.0, 0.0, SEARCH)
+        solve_albedos(model, SPOTS[:few], counts[:few], (30.0, 0.0, 0.0), SEARCH)
         rough[few] = model.albedo().std().item()
     assert rough[10] < rough[100]
 
@@ -97,8 +117,8 @@ def test_effects_stand_still_and_are_seen_through():
     counts = board(torch.ones(5, 5)).expected(SPOTS, extension)
     seen, blind = board(torch.full((5, 5), 0.5)), board(torch.full((5, 5), 0.5))
     before = {name: value.clone() for name, value in extension.state_dict().items()}
-    solve_albedos(seen, SPOTS, counts, 0.7, 1.0, SEARCH, extension)
-    solve_albedos(blind, SPOTS, counts, 0.7, 1.0, SEARCH)
+    solve_albedos(seen, SPOTS, counts, (0.7, 1.0, 0.0), SEARCH, extension)
+    solve_albedos(blind, SPOTS, counts, (0.7, 1.0, 0.0), SEARCH)
     assert all(torch.equal(value, before[name]) for name, value in extension.state_dict().items())
     assert all(p.grad is None for p in [*extension.parameters(), *seen.parameters()])
     errors = [(m.albedo() - 1).abs().mean().item() for m in (seen, blind)]
@@ -122,7 +142,7 @@ def test_fourth_bounces_stay_what_they_are():
     seen, blind = corner(0.9), corner(0.9)
     for model, extension in ((seen, fourth), (blind, Extension([]))):
         for _ in range(3):  # each with those of the albedos before
-            solve_albedos(model, SPOTS, counts, 0.7, 1.0, SEARCH, extension)
+            solve_albedos(model, SPOTS, counts, (0.7, 1.0, 0.0), SEARCH, extension)
     errors = [(m.albedo() - 1).abs().mean().item() for m in (seen, blind)]
     assert errors[0] < 0.5 * errors[1]
 
@@ -296,6 +316,32 @@ def test_missing_bodies_come_first_while_there_are_any_and_they_help(monkeypatch
             assert len(fit.model) == before
             nats -= gain
     assert began == seen
+
+
+def test_surfels_cost_something_from_outlines_until_rounds_are_judged(monkeypatch):
+    """A copy, and a fit that is restored, know whether they still do."""
+
+    def costs(fit: SurfelFit) -> bool:
+        found = []
+        for lean in (0.0, 5.0):
+            fit.settings = dataclasses.replace(fit.settings, lean=lean)
+            found.append(fit.loss(torch.arange(8))["albedos"].item())
+        return found[1] > found[0]
+
+    fit = waiting()
+    for plan, told in (([Round(1, grow=True)], False), ([Round(1, outline=True)], True)):
+        fit.schedule(plan)
+        assert costs(fit) == told
+    fit.schedule([Round(1, onward=True)])
+    assert costs(fit)
+    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
+    fit.schedule([], 1)
+    assert not costs(fit)
+    other, again = fit.copy(fit.extension, 0), waiting()
+    again.restore(fit.state())
+    for each in (other, again):
+        each.schedule([Round(1, onward=True)])
+        assert not costs(each)
 
 
 @pytest.mark.parametrize("divided", [True, False])

@@ -384,7 +384,7 @@ def test_a_body_that_is_missing_is_found(fitted):
     number = begin_bodies(model, grid, test, reserve)
     assert torch.equal(model.centre()[: len(front)], front)
     assert len(model) == len(front) + number
-    solve_albedos(model, train, counts, 0.7, 1.0, SEARCH)
+    solve_albedos(model, train, counts, (0.7, 1.0, 0.0), SEARCH)
     away = model.centre().detach()[len(front) :] - torch.tensor([-0.15, -0.12, 0.75])
     reach = torch.tensor([0.175, 0.15, 0.0]) + float(model.cell.max())
     inside, albedo = (away.abs() < reach).all(1), model.albedo().detach()[len(front) :]
