@@ -366,7 +366,8 @@ class Loop:
     def _anew(self, members: list[Member], coarse: SurfelFit) -> list[Member]:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
-        A scene that has bent itself to a term cannot go on without it as well as one that never had it.
+        A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
+        effects must be asked for beside such a scene when it has become fine.
         """
         names = [m.name for m in members]
         value, found = log_likelihood(coarse, self.split.select), []
@@ -382,8 +383,25 @@ class Loop:
             now = replace(
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
-            found.append(replace(member, confirmed=now, accepted=now.holds(member.candidate.free)))
+            free, per_spot = member.candidate.free, member.candidate.effect.per_spot
+            if now.holds(free) and not free and not per_spot:
+                evidence = self._beside_fine(fit, member.name, kept)
+                now = now if evidence > self.least else replace(now, evidence=evidence, needed=self.least)
+            found.append(replace(member, confirmed=now, accepted=now.holds(free)))
         return found
+
+    def _beside_fine(self, fit: SurfelFit, name: str, kept: str) -> float:
+        """Nats that a term has beside a scene without it, when that has become fine: cells too wide for a
+        scene ask for terms that it does not need.
+        """
+        s = self.settings
+        self.steps.plan(fit=1, screen=1)
+        text = f"refining the scene without {name}"
+        fine = self.steps("fit", text, f"{kept}_fine", lambda: solve_spots(self.grow(fit, self.seed)))
+        given = (fine, self.split, self.scan, s.spots, self.seed, self.least, 0, True, {name})
+        asking = partial(ask, *given)
+        (found,) = self.steps("screen", f"asking for {name}", f"{kept}_asked", asking).candidates
+        return found.evidence
 
     def _without_it(self, scene: SurfelFit, name: str) -> SurfelFit:
         """A parsimonious scene without a term: gone on with, or built anew, whichever predicts better."""

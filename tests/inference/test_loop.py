@@ -87,6 +87,7 @@ class World:
         beside: terms that show only where all of some others are in the model.
         rivals: of terms, by name.
         impossible: effects with which no surfel survives a rebuild.
+        when_fine: what the pool says of terms beside a fine scene, where that is something else.
         misfit: nats that every scene leaves of select spots. taken_up: of the fitted spots, fewer.
     """
 
@@ -102,7 +103,9 @@ class World:
         misfit: float = 0.0,
         taken_up: float = 0.0,
         lost: dict[str, float] | None = None,
+        when_fine: dict[str, float] | None = None,
     ) -> None:
+        self.when_fine = when_fine or {}
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
         self.beside, self.rivals, self.lost = beside or {}, rivals or {}, lost or {}
         self.rebuilt: list[tuple[frozenset[str], int]] = []
@@ -128,6 +131,8 @@ class World:
     ) -> Pool:
         shown = [c for c in self.pool if self.beside.get(c.name, set()) <= fit.names]
         found = [c for c in shown if c.name not in fit.names and (only is None or c.name in only)]
+        if fit.fine:
+            found = [replace(c, evidence=self.when_fine.get(c.name, c.evidence)) for c in found]
         asked = [c for c in found if c.evidence > least and not c.effect.per_spot]
         named = [c for c in asked if c.name not in FREE_NAMES]
         asked = ((effects and named) or [c for c in asked if c.name in FREE_NAMES])[:room]
@@ -291,7 +296,8 @@ def test_terms_come_together_and_others_after_them(monkeypatch):
     built = [names for names, _ in world.rebuilt]
     assert built[:2] == [{"irf_tail", "pile_up"}, {*table}]
     assert built[2:] == [{*table} - {name} for name in table], "each is asked for beside a scene without it"
-    assert world.grown == [set(), {*table}], "the base, and once with all"
+    assert world.grown[:2] == [set(), {*table}], "the base, and once with all"
+    assert world.grown[2:] == built[2:], "and these are asked again when they are fine"
     assert [len(p.together) for p in found.pools] == [2, 1, 0]
     assert found.final.names == found.again.names == {*table}
     assert (found.final.fine, found.again.fine) == (True, False)
@@ -316,7 +322,7 @@ def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
         assert built[0] == {"irf_tail", "pile_up"}
         assert all("pile_up" not in names for names in built[1:]), "it has left"
         assert world.grown[:3] == [set(), {"irf_tail", "pile_up"}, {"irf_tail"}]
-        assert world.grown[3:] == [{"irf_tail", "free_time"}], "and not again without it"
+        assert world.grown[3:] == [set(), {"irf_tail", "free_time"}], "without it once, and not again"
         assert world.asked == [["irf_tail", "pile_up"], ["irf_tail"], ["free_time"]]
 
 
@@ -429,6 +435,23 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
     assert (found.accepted, scene.names) == (accepted, {"irf_tail"} if accepted else set())
     assert found.confirmed.gain.nats == pytest.approx(70.0 - other)
     assert world.rebuilt == [(set(), 4)]
+
+
+@pytest.mark.parametrize("name", ["retroreflection", "free_time", "timing_jitter"])
+@pytest.mark.parametrize(("over", "accepted"), [(-0.1, False), (0.1, True)])
+def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(monkeypatch, name, over, accepted):
+    """Wide cells may ask for what a finer scene does by itself. Free terms claim no cause; single spots have
+    over their neighbours what no scene can give them.
+    """
+    world = World(monkeypatch, {name: nats(70.0)}, [candidate(name)], when_fine={name: LEAST + over})
+    scenes = fitted(name, fine=True), fitted(name)
+    (found,), scene, _ = world.loop().hold(
+        [Member(world.pool[0])], *scenes, Held([], fitted(fine=True), fitted())
+    )
+    accepted = accepted or name != "retroreflection"
+    assert (found.accepted, scene.names) == (accepted, {name} if accepted else set())
+    if not accepted:
+        assert (found.confirmed.evidence, found.confirmed.needed) == (pytest.approx(LEAST - 0.1), LEAST)
 
 
 def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
