@@ -385,21 +385,19 @@ class Loop:
             )
             free, per_spot = member.candidate.free, member.candidate.effect.per_spot
             if now.holds(free) and not free and not per_spot:
-                evidence = self._beside_fine(fit, member.name, kept)
+                self.steps.plan(fit=1, screen=1)
+                fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
+                evidence = self._beside(fine, member.name, kept)
                 now = now if evidence > self.least else replace(now, evidence=evidence, needed=self.least)
             found.append(replace(member, confirmed=now, accepted=now.holds(free)))
         return found
 
-    def _beside_fine(self, fit: SurfelFit, name: str, kept: str) -> float:
-        """Nats that a term has beside a scene without it, when that has become fine: cells too wide for a
-        scene ask for terms that it does not need.
+    def _beside(self, fine: SurfelFit, name: str, kept: str) -> float:
+        """Nats that a term has beside a fine scene without it: cells too wide for a scene ask for terms that
+        it does not need.
         """
-        s = self.settings
-        self.steps.plan(fit=1, screen=1)
-        text = f"refining the scene without {name}"
-        fine = self.steps("fit", text, f"{kept}_fine", lambda: solve_spots(self.grow(fit, self.seed)))
-        given = (fine, self.split, self.scan, s.spots, self.seed, self.least, 0, True, {name})
-        asking = partial(ask, *given)
+        given = (self.split, self.scan, self.settings.spots, self.seed, self.least, 0, True, {name})
+        asking = partial(ask, fine, *given)
         (found,) = self.steps("screen", f"asking for {name}", f"{kept}_asked", asking).candidates
         return found.evidence
 

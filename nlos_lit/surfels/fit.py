@@ -35,7 +35,7 @@ PLAIN = (
     "before",
     "undo",
     "finer",
-    "lean",
+    "priced",
     "history",
     "losses",
 )
@@ -112,7 +112,7 @@ class SurfelSettings:
         if not 0 < self.floor < 1 or least < 0:
             raise UserError(
                 "surfels.floor must lie between 0 and 1, and surfels.contest, outlines, more, bending, "
-                f"evenness, brightness, lean and surfel_cost be 0 or more; found "
+                "evenness, brightness, lean and surfel_cost be 0 or more; found "
                 f"floor={self.floor} and {least}"
             )
 
@@ -232,7 +232,7 @@ class SurfelFit:
         self.more, self.bodies = 0, 0  # rounds that may follow, and those before which bodies are begun
         self.before = torch.zeros(0)  # nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
-        self.lean = True  # no round was judged yet: surfels cost something
+        self.priced = True  # no round was judged yet: surfels cost something
         self.finer = True  # surfels may be divided before one of them
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []
@@ -253,7 +253,7 @@ class SurfelFit:
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
         order = torch.randperm(len(self.train), generator=generator)
         other = SurfelFit(model, *parts, extension, generator, order, self.judged)
-        other.lean = self.lean
+        other.priced = self.priced
         return other
 
     def parts(self) -> dict[str, Any]:
@@ -410,7 +410,7 @@ class SurfelFit:
             s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
             divide = self.finer and wide and 4 * len(self.model) <= s.most
             parts = 2 if divide else 1
-        self.lean = False
+        self.priced = False
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
         self.before, self.undo = nats, undo
 
@@ -563,7 +563,7 @@ class SurfelFit:
     def _albedo_weights(self) -> tuple[float, float, float]:
         """Of what albedos cost in the present round."""
         s, outlined = self.settings, any(now.outline or now.onward for now in self.plan[:1])
-        return s.evenness, s.brightness, s.lean if self.lean and outlined else 0.0
+        return s.evenness, s.brightness, s.lean if self.priced and outlined else 0.0
 
     def step(self) -> None:
         """One batch."""
