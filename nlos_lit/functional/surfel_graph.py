@@ -69,7 +69,7 @@ class Sheet(NamedTuple):
     bow: Tensor  # [P] m, as far as an arc from i to j leaves i's plane, that is at rest
     mean: Tensor  # [P] share of j in the average about i
     own: Tensor  # [M] share of i in it
-    rim: Tensor  # [M] how far neighbours lie to one side: 0 all around, 1 where half of them are missing
+    outward: Tensor  # [M, 3] away from where neighbours lie: 0 all around, length 1 where half are missing
 
     @property
     def as_it_was(self) -> bool:
@@ -120,10 +120,12 @@ def lay_sheet(
     rest = height if as_it_is else torch.zeros_like(height)
     bow = _bow(normal, d, pairs) if as_it_is else torch.zeros_like(height)
     mean, own = trust / total[i], weight.clamp_min(1e-6) / total
-    aside = torch.zeros_like(normal[:, :2]).index_add(0, i, trust[:, None] * along).norm(dim=1)
-    reach = torch.zeros_like(aside).index_add(0, i, trust * along.norm(dim=1))
-    rim = (math.pi / 2 * aside / reach.clamp_min(1e-12)).clamp_max(1.0)
-    return Sheet(pairs, normal, first, second, share, rest, bow, mean, own, rim)
+    aside = torch.zeros_like(normal[:, :2]).index_add(0, i, trust[:, None] * along)
+    reach = torch.zeros_like(total).index_add(0, i, trust * along.norm(dim=1)).clamp_min(1e-12)
+    missing = -math.pi / 2 * aside / reach[:, None]
+    missing = missing / missing.norm(dim=1, keepdim=True).clamp_min(1.0)
+    outward = missing[:, :1] * first + missing[:, 1:] * second
+    return Sheet(pairs, normal, first, second, share, rest, bow, mean, own, outward)
 
 
 def curvature_of(sheet: Sheet, normal: Tensor, cell: float) -> Tensor:
@@ -218,8 +220,32 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
     d = centre.index_select(0, j) - centre.index_select(0, i)
     height = (d * sheet.normal.index_select(0, i)).sum(1) - sheet.rest
     planes = _leaning(sheet, height)
-    bow = sheet.rim.index_select(0, i) * (_bow(planes, d, sheet.pairs) - sheet.bow)
+    rim = sheet.outward.norm(dim=1).index_select(0, i)
+    bow = rim * (_bow(planes, d, sheet.pairs) - sheet.bow)
     return _leaning(sheet, height + bow)
+
+
+def rolled_off(normal: Tensor, outward: Tensor, roll: Tensor) -> Tensor:
+    """Normals that lean outwards at rims, as round bodies turn away from the wall within a cell.
+
+    Places of neighbours on one side do not say how a surface goes on at the other; how bright it is from
+    where on the wall does.
+
+    Args:
+        normal: ``[M, 3]`` unit.
+        outward: ``[M, 3]`` from :func:`lay_sheet`.
+        roll: tangent of the angle where half of the neighbours are missing, a scalar.
+
+    Returns:
+        ``[M, 3]`` unit, differentiable.
+
+    Examples:
+        >>> facing = torch.tensor([[0.0, 0.0, -1.0]])
+        >>> leaning = rolled_off(facing, torch.tensor([[1.0, 0.0, 0.0]]), torch.tensor(1.0))
+        >>> [round(x, 2) for x in leaning[0].tolist()]
+        [0.71, 0.0, -0.71]
+    """
+    return torch.nn.functional.normalize(normal + roll * outward, dim=1)
 
 
 def _leaning(sheet: Sheet, height: Tensor) -> Tensor:

@@ -5,8 +5,8 @@ Rows are gated bins of the looked-at spots, divided by √μ, so that counts of 
 variance.
 
 - ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, where each patch of
-  the scene lies along x and y, the laser-sensor response, what passes the sheets in front, and the parameters
-  of effects that were accepted before.
+  the scene lies along x and y, the laser-sensor response, what passes the sheets in front, how far rims roll
+  off, and the parameters of effects that were accepted before.
 - ``U [N, Q]``: how bright each patch is from where on the wall, all alike unknown by a deviation of its own.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
@@ -128,10 +128,10 @@ def build_problem(
         surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
-        if len(model.hiders):
-            whole = _Forward(model, extension, partial(_render, part))
-            opacity = model.raw_opacity.detach()
-            both.append(_jvp(whole, "model.raw_opacity", opacity, torch.ones_like(opacity)))
+        whole = _Forward(model, extension, partial(_render, part))
+        alike = {"roll": model.roll} | ({"raw_opacity": model.raw_opacity} if len(model.hiders) else {})
+        for name, p in alike.items():
+            both.append(_jvp(whole, f"model.{name}", p.detach(), torch.ones_like(p)))
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]

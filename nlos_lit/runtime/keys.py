@@ -141,6 +141,7 @@ SURFELS: dict[str, Rule] = {
     "depth_rate": number(0, 100, "bins"),
     "albedo_rate": _rate,
     "opacity_rate": _rate,
+    "roll_rate": _rate,
     "response_rate": _rate,
     "effect_rate": _rate,
     "bending": _weight,

@@ -65,6 +65,7 @@ class SurfelSettings:
         batch: spots a step.
         depth_rate: of Adam, in bins there and back.
         albedo_rate, opacity_rate, response_rate: of the unconstrained values.
+        roll_rate: of how far rims roll off.
         effect_rate: of physical effects, in their own noticeable steps.
         bending: weight against neighbours that do not fit one surface (:meth:`SurfelModel.bending`); 1 takes
             it for the logarithm of a prior.
@@ -94,6 +95,7 @@ class SurfelSettings:
     depth_rate: float = 0.15
     albedo_rate: float = 0.08
     opacity_rate: float = 0.2
+    roll_rate: float = 0.05
     response_rate: float = 0.03
     effect_rate: float = 0.1
     bending: float = 0.5
@@ -496,22 +498,29 @@ class SurfelFit:
     def _new_optimizer(self) -> torch.optim.Optimizer:
         """With the rates of the next batch of the present round."""
         s, model = self.settings, self.model
-        # The response waits for the places: it would otherwise settle around errors of the seeds.
+        # The response waits for the places: it would otherwise settle around errors of the seeds. Rims wait
+        # until sheets are found, which would end before they reach as far as they do.
         response_rate = s.response_rate * (0.3 if self.plan[0].settling else 1.0)
-        settled = [] if self.plan[0].contest else [model.raw_depth, model.raw_shift]
-        response = [] if self.plan[0].contest else [*model.laser_sensor.parameters()]
-        opacity = [] if self.plan[0].contest else [model.raw_opacity]
+        settled = [
+            {"params": [model.raw_depth, model.raw_shift], "lr": s.depth_rate},
+            {"params": [model.raw_opacity], "lr": s.opacity_rate},
+            {"params": [model.roll] if self._outlined else [], "lr": s.roll_rate},
+            {"params": [*model.laser_sensor.parameters()], "lr": response_rate},
+        ]
         groups = [
-            {"params": settled, "lr": s.depth_rate},
             {"params": [model.raw_albedo], "lr": s.albedo_rate},
-            {"params": opacity, "lr": s.opacity_rate},
-            {"params": response, "lr": response_rate},
             {"params": self._effect_parameters(), "lr": s.effect_rate},
+            *([] if self.plan[0].contest else settled),
         ]
         kept = [group | {"highest": group["lr"]} for group in groups if group["params"]]
         optimizer = torch.optim.Adam(kept, betas=(0.9, 0.98))
         self._set_rates(optimizer)
         return optimizer
+
+    @property
+    def _outlined(self) -> bool:
+        """The present round finds outlines, or goes on from some."""
+        return any(now.outline or now.onward for now in self.plan[:1])
 
     def _effect_parameters(self) -> list[torch.nn.Parameter]:
         """Those that a round fits: where a disc is, or how late an echo, waits for the scene to settle."""
@@ -550,11 +559,11 @@ class SurfelFit:
         """
         s, model = self.settings, self.model
         per_count = 1 / (len(self.train) * self.counts.shape[1])  # nats over all spots to the mean over bins
-        placed = model.placed()
-        expected = model.render(self.train[rows], self.extension, placed).clamp_min(1e-12)
+        laid = model.laid()
+        expected = model.render(self.train[rows], self.extension, model.leaning(laid)).clamp_min(1e-12)
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
-            "bending": s.bending * per_count * model.bending(placed),
+            "bending": s.bending * per_count * model.bending(laid),
             "albedos": per_count * model.albedo_cost(*self._albedo_weights()),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }
@@ -562,8 +571,8 @@ class SurfelFit:
 
     def _albedo_weights(self) -> tuple[float, float, float]:
         """Of what albedos cost in the present round."""
-        s, outlined = self.settings, any(now.outline or now.onward for now in self.plan[:1])
-        return s.evenness, s.brightness, s.lean if self.priced and outlined else 0.0
+        s = self.settings
+        return s.evenness, s.brightness, s.lean if self.priced and self._outlined else 0.0
 
     def step(self) -> None:
         """One batch."""

@@ -23,6 +23,7 @@ from nlos_lit.functional.surfel_graph import (
     level_of,
     neighbour_pairs,
     presence,
+    rolled_off,
     sheet_normals,
 )
 from nlos_lit.functional.surfel_paths import (
@@ -77,6 +78,10 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
+        outward: ``[M, 3]`` where sheets end, and how much of their neighbours surfels lack, from when they were
+            last laid.
+        roll: how far normals lean that way (:func:`~nlos_lit.functional.surfel_graph.rolled_off`), one number
+            for the scene: boards end, and round bodies turn away.
         curvature: ``[M, 3, 3]`` 1/m, see :func:`~nlos_lit.functional.surfel_paths.on_patch`; it follows from
             the normals of neighbours when a sheet is laid or lifted.
         hiders: ``[1 or 2, S, M, K]`` which surfel hides each of K points of every surfel from each spot's
@@ -94,6 +99,7 @@ class SurfelModel(nn.Module):
     cell: Tensor
     anchor: Tensor
     direction: Tensor
+    outward: Tensor
     curvature: Tensor
     hiders: Tensor
     observed: Tensor
@@ -127,6 +133,7 @@ class SurfelModel(nn.Module):
         self.register_buffer("observed", torch.from_numpy(seen), persistent=False)
         cell = torch.tensor([abs(float(c)) for c in lateral.pitch], device=self.laser.device)
         self.register_buffer("cell", cell, persistent=False)
+        self.roll = nn.Parameter(torch.zeros((), device=self.laser.device))
         self.place(centre, normal, albedo)
 
     def place(
@@ -153,6 +160,7 @@ class SurfelModel(nn.Module):
         self.register_buffer(
             "direction", torch.where(steep, -normal, torch.tensor([0.0, 0.0, 1.0], device=device))
         )
+        self.register_buffer("outward", torch.zeros(len(centre), 3, device=device))
         curved = torch.zeros(len(centre), 3, 3, device=device)
         if curvature is not None:
             curved[: len(curvature)] = curvature
@@ -203,6 +211,15 @@ class SurfelModel(nn.Module):
 
     def placed(self) -> tuple[Tensor, Tensor]:
         """:meth:`centre` and :meth:`normal`; on a sheet the second follows from the first."""
+        return self.leaning(self.laid())
+
+    def leaning(self, laid: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+        """:meth:`placed` from :meth:`laid`."""
+        centre, normal = laid
+        return centre, rolled_off(normal, self.outward, self.roll)
+
+    def laid(self) -> tuple[Tensor, Tensor]:
+        """:meth:`placed` with normals that do not lean outwards at rims."""
         centre = self.centre()
         if self.sheet is not None:
             return centre, sheet_normals(self.sheet, centre)
@@ -236,13 +253,15 @@ class SurfelModel(nn.Module):
         """
         self.lift()
         cell = float(self.cell.max())
-        self.sheet = lay_sheet(*self.placed(), self.trust(), self.pairs, cell, as_it_is)
+        self.sheet = lay_sheet(*self.laid(), self.trust(), self.pairs, cell, as_it_is)
+        if not as_it_is:
+            self.outward.copy_(self.sheet.outward)
         self._curve()
 
     @torch.no_grad()
     def lift(self) -> None:
         """Places and normals stay as they are, and stand for themselves from now on."""
-        centre, normal = self.placed()
+        centre, normal = self.laid()
         self._curve()
         self.raw_normal.copy_(normal)
         self.anchor.copy_(centre)
@@ -260,16 +279,16 @@ class SurfelModel(nn.Module):
         albedo = self.albedo().detach()
         return albedo / (albedo + 0.3 * albedo.mean())
 
-    def bending(self, placed: tuple[Tensor, Tensor]) -> Tensor:
+    def bending(self, laid: tuple[Tensor, Tensor]) -> Tensor:
         """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`.
 
         Args:
-            placed: from :meth:`placed`.
+            laid: from :meth:`laid`: how rims roll off is one number, and no bend of each.
 
         Returns:
             A scalar, differentiable.
         """
-        return bending(*placed, self.trust(), self.pairs)
+        return bending(*laid, self.trust(), self.pairs)
 
     def albedo_cost(
         self, evenness: float, bright: float, there: float, albedo: Tensor | None = None

@@ -126,8 +126,8 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
         if fit.round_done:
             fit.end_round()
     first, last = np.array(rates[:4]), np.array(rates[4:])
-    highest = [0.15, 0.08, 0.2, 0.03, 0.1]
-    slow = [1, 1, 1, 0.3, 1]  # the response waits
+    highest = [0.08, 0.1, 0.15, 0.2, 0.05, 0.03]
+    slow = [1, 1, 1, 1, 1, 0.3]  # the response waits
     assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, np.multiply(highest, slow)))
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from data_modules.simulate import ScanPlan, SensorModel, join, simulate_capture
-from data_modules.simulate.scenes import plate
+from data_modules.simulate.scenes import plate, sphere
 from data_modules.spots import heldout_mask
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
@@ -233,7 +233,7 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
     tail.set("decay", 25 * BIN)
     expected = model.expected(spots, Extension([tail]))
     leaks = []
-    for seed in range(3):
+    for seed in range(8):
         counts = torch.poisson(expected, generator=torch.Generator().manual_seed(seed))
         found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
         choose_shapes(model, found, spots, counts)
@@ -465,8 +465,9 @@ def test_dispersion_looks_at_places_with_too_much_light_alone():
 
 
 def flat_sheet(capture: Capture, result, tilt: float = 0.0) -> SurfelModel:
-    """3 × 3 surfels of one plane, the middle one turned by ``tilt`` about y."""
+    """3 × 3 surfels of one plane, the middle one turned by ``tilt`` about y; rims do not roll off."""
     model = SurfelModel.from_state(capture, result.model.state_dict())
+    model.roll.data.zero_()
     x, y = torch.meshgrid(*(torch.arange(-1.0, 2.0) * float(model.cell[0]),) * 2, indexing="ij")
     centre = torch.stack([x.reshape(-1), y.reshape(-1), torch.full((9,), 0.6)], 1)
     normal = torch.tensor([[0.0, 0.0, -1.0]]).repeat(9, 1)
@@ -577,6 +578,33 @@ def test_normals_at_a_rim_are_those_of_a_round_body():
     assert off[1:-1].max() < 0.1, "neighbours are all around"
 
 
+def test_rims_lean_outwards(fitted):
+    """A row of three rolls off at its ends, by as much however often it is laid."""
+    capture, result = fitted[0], fitted[-1]
+    model = flat_sheet(capture, result)
+    model.roll.data.fill_(0.5)
+    for as_it_is in (False, False, True):
+        model.lay(as_it_is)
+        x, y, z = model.normal().detach().T
+        assert torch.allclose(x[[1, 4, 7]], torch.tensor([-1.0, 0.0, 1.0]) * x[7], atol=1e-6)
+        assert torch.allclose(y[[3, 4, 5]], torch.tensor([-1.0, 0.0, 1.0]) * x[7], atol=1e-6)
+        # π/2 · (w + 2v)/(3w + 2√2 v), neighbours in a cell's distance of weight w, diagonal ones of v
+        assert -x[7] / z[7] == pytest.approx(0.5 * 0.758, abs=0.001)
+        model.lift()
+        assert torch.allclose(model.normal(), torch.stack([x, y, z], 1), atol=1e-6)
+    assert torch.autograd.grad(model.normal()[7, 0], model.roll)[0] > 0.4
+
+
+def test_how_far_rims_roll_off_is_found(fitted):
+    """Plates end; a ball turns away from the wall within a cell, and is darker from straight ahead by that."""
+    assert abs(fitted[-1].model.roll) < 0.05
+    scan = ScanPlan(kind="confocal", nx=20, ny=20, width=1.0, n_bins=190, bin_length=BIN, t_start=0.6)
+    sensor = SensorModel(sigma=1.0 * BIN, kappa=0.6 / BIN, background=0.15, mean_counts=1500)
+    capture, _ = simulate_capture(sphere((0.05, 0.0, 0.6), 0.15), scan, sensor, seed=2)
+    spots = np.arange(400)
+    assert fit_surfels(capture, *image(capture), QUICK, spots, seed=0).model.roll > 0.15
+
+
 def test_a_sheet_that_is_laid_as_it_is_begins_with_its_own_normals(fitted):
     capture, result = fitted[0], fitted[-1]
     model = flat_sheet(capture, result, tilt=0.5)
@@ -598,7 +626,7 @@ def test_what_goes_on_begins_where_it_ended(fitted):
     capture, held, grid, result = fitted[0], fitted[1], fitted[3], fitted[-1]
     train = torch.from_numpy(np.flatnonzero(~held))
     counts = torch.from_numpy(capture.gated_counts())[train]
-    rates = dict.fromkeys(("depth_rate", "albedo_rate", "opacity_rate", "response_rate"), 1e-9)
+    rates = dict.fromkeys(("depth_rate", "albedo_rate", "opacity_rate", "roll_rate", "response_rate"), 1e-9)
     settings, nothing = dataclasses.replace(QUICK, **rates), Seeds(torch.zeros(0, 3), torch.zeros(0, 3))
     model = SurfelModel.from_state(capture, result.model.state_dict())
     model.update_hiders()
