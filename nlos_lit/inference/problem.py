@@ -33,8 +33,7 @@ from nlos_lit.effects.free_terms import FREE
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
 
-# Of the scene. Each looks brighter from some wall points than from others: normals, relief and hidden
-# sides are not known exactly.
+# Of the scene. Each looks brighter from some wall points than from others: normals are not known exactly.
 PATCHES = 32
 CHUNK = 1 << 25  # elements of a batch's columns
 BATCH = 1 << 19  # … of a batch's transients
@@ -119,7 +118,7 @@ def build_problem(
         expected = model.expected(spots, extension).clamp_min(1e-6)
     m, first = len(model), model.gate[0]
     towards, patch, coarse = towards_wall(model), patches_of(model, patches or m), patches_of(model, PATCHES)
-    size = max(1, CHUNK // (model.n_bins * (3 * m + 8 * PATCHES)))
+    size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
@@ -399,19 +398,17 @@ def patches_of(model: SurfelModel, most: int) -> Tensor:
 
 
 def towards_wall(model: SurfelModel) -> Tensor:
-    """``[S, J]`` linear and quadratic functions of every spot's wall point, of mean 0 and mean square 1.
+    """``[S, J]`` linear functions of every spot's wall point, of mean 0 and mean square 1.
 
-    Five of each of laser and sensor point that moves.
+    Two of each of laser and sensor point that moves: a patch whose normal is wrong is brighter on one side.
     """
     points = [p[:, :2] for p in (model.sensor, model.laser) if float((p - p[:1]).abs().max()) > 0]
     if len(points) == 2 and torch.equal(*points):
         points = points[:1]
     found = []
     for p in points:
-        x, y = (p - p.mean(0)).unbind(1)
-        found += [x, y, x * x, x * y, y * y]
+        found += (p - p.mean(0)).unbind(1)
     functions = torch.stack(found, 1)
-    functions = functions - functions.mean(0)
     return functions / functions.square().mean(0).sqrt().clamp_min(1e-12)
 
 

@@ -78,7 +78,7 @@ class SurfelModel(nn.Module):
     Attributes:
         anchor: ``[M, 3]`` m, centres at depth 0.
         direction: ``[M, 3]`` unit.
-        outward: ``[M, 3]`` where sheets end, and how much of their neighbours surfels lack, from when they were
+        outward: ``[M, 3]`` where sheets end, and how much of their neighbours surfels lack, as when they were
             last laid.
         roll: how far normals lean that way (:func:`~nlos_lit.functional.surfel_graph.rolled_off`), one number
             for the scene: boards end, and round bodies turn away.

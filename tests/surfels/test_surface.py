@@ -596,7 +596,7 @@ def test_rims_lean_outwards(fitted):
 
 
 def test_how_far_rims_roll_off_is_found(fitted):
-    """Plates end; a ball turns away from the wall within a cell, and is darker from straight ahead by that."""
+    """Plates end; a ball turns away from the wall within a cell, and is darker from straight ahead."""
     assert abs(fitted[-1].model.roll) < 0.05
     scan = ScanPlan(kind="confocal", nx=20, ny=20, width=1.0, n_bins=190, bin_length=BIN, t_start=0.6)
     sensor = SensorModel(sigma=1.0 * BIN, kappa=0.6 / BIN, background=0.15, mean_counts=1500)
