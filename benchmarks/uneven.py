@@ -3,7 +3,7 @@
     python benchmarks/uneven.py 2 4 21         development captures without effects, of scenes of our own
 
 The light of the true surface is put together by the surfel that is nearest to it, and fitted as the surfels'
-own light times 1 plus five functions of the wall point. Printed are root mean squares of their coefficients,
+own light times 1 plus linear functions of the wall point. Printed are root mean squares of their coefficients,
 weighted by light, over groups of surfels that lie together; then what the counts alone ask for, of 32 groups,
 which is what the pool reckons with (docs/notebook.md).
 """
@@ -34,7 +34,7 @@ def lights(model, scene) -> tuple[Tensor, Tensor]:
         torch.from_numpy(v).float()
         for v in (elements.centre, elements.normal, elements.area * elements.albedo, 1.0 * scene.seen)
     )
-    centre, facing = model.placed()
+    centre, _ = model.placed()
     nearest = torch.from_numpy(cKDTree(centre.numpy()).query(elements.centre)[1])
     fitted, true = [], []
     for spots in torch.arange(len(model.laser)).split(48):
@@ -44,9 +44,7 @@ def lights(model, scene) -> tuple[Tensor, Tensor]:
             model.sensor[spots],
             model.sensor_normal[spots],
         )
-        own = trace(centre, facing, model.cell, quadrature(model.quadrature), *wall, model.confocal)
-        clear = model.arriving(model.visible[spots]) if len(model.visible) else 1.0
-        fitted.append(own.contribution.sum(2) * model.albedo() * clear)
+        fitted.append(model.paths(spots).contribution.sum(2) * model.albedo())
         paths = trace(place, normal, torch.ones(2), quadrature(1), *wall, model.confocal)
         light = paths.contribution[:, :, 0] / paths.area * shine * seen[spots]
         true.append(torch.zeros(len(spots), len(centre)).index_add_(1, nearest, light))
@@ -89,6 +87,7 @@ def report(index: int) -> None:
     from wild_truth import make
 
     from data_modules.readers import read_capture
+    from nlos_lit.effects.extension import Extension
     from nlos_lit.inference.problem import patches_of, towards_wall
     from nlos_lit.inference.split import split_spots
 
@@ -101,7 +100,7 @@ def report(index: int) -> None:
         return
     pipeline, split = pipeline_for(capture), split_spots(capture)
     with torch.enable_grad():
-        base = pipeline(capture, split, 0)
+        base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
         fine = pipeline.grow(base, 0)
     for name, fit in (("base", base), ("fine", fine)):
         model = fit.model

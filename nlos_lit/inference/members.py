@@ -160,14 +160,19 @@ def chosen(trials: list[Trial], odds: float) -> Trial:
     Args:
         trials: in one place, with weights, the largest gain first; none is not chosen.
         odds: share of the best one's weight from which on a simpler one goes before it, as it does from
-            ``MOST`` of its gain on.
+            ``MOST`` of its gain on; but no effect before a free term that predicts better by so much weight.
 
     Returns:
         an effect before a free term, few coefficients before many.
     """
     first, *others = [t for t in trials if t.candidate is not None]
-    near = [t for t in others if t.gain.nats >= MOST * first.gain.nats or t.weight >= odds * first.weight]
-    return min([first, *near], key=cost)
+
+    def near(trial: Trial) -> bool:
+        unknown = first.name in FREE_NAMES and trial.name not in FREE_NAMES
+        gains = trial.gain.nats >= MOST * first.gain.nats and not unknown
+        return gains or trial.weight >= odds * first.weight
+
+    return min([first, *filter(near, others)], key=cost)
 
 
 def cost(trial: Trial) -> tuple[bool, int, float]:

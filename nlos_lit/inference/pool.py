@@ -88,7 +88,8 @@ class Taken:
     Args:
         candidate: as the linear problem sees it beside those that were taken before it.
         rivals: terms of its kind that were asked for until it was taken, and have less than half of their
-            evidence beside it; most evidence first.
+            evidence beside it; most evidence first. Before them, if it is an effect and the first to be taken,
+            the free term with most evidence, if it has more.
     """
 
     candidate: Candidate
@@ -249,10 +250,16 @@ def together(
             lost = [
                 c for c, now in zip(before, asked, strict=True) if c.evidence > max(least, 2 * now.evidence)
             ]
-            taken.append(Taken(first, sorted(lost, key=lambda c: -c.evidence)))
+            ahead = [] if free or taken else [c for c in candidates if _leads(c, first)][:1]
+            taken.append(Taken(first, ahead + sorted(lost, key=lambda c: -c.evidence)))
             rivals = {c.name for c in lost}
             asked = [c for c in asked if c.loud > least and c.name not in rivals]
     return taken
+
+
+def _leads(candidate: Candidate, effect: Candidate) -> bool:
+    """It is a free term that is asked for more than an effect."""
+    return candidate.free and not candidate.effect.per_spot and candidate.evidence > effect.evidence
 
 
 def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:

@@ -524,14 +524,18 @@ def taken(
 
 def test_terms_are_asked_for_beside_those_that_were_taken(alike):
     """The first leaves nothing for what looks like it, which is its rival; the other is asked for as before.
-    A free term is taken only where no effect is, or none may be.
+    A free term is taken only where no effect is, or none may be; where it is asked for more than the first
+    effect it is a rival of that.
     """
-    assert taken([2.0, 0.0, 1.0], alike, 9) == [("irf_tail", ["afterpulsing"]), ("pile_up", [])]
-    assert taken([2.0, 0.0, 1.0], alike, 1) == [("irf_tail", ["afterpulsing"])]
+    assert taken([2.0, 0.0, 1.0], alike, 9) == [("irf_tail", ["free_rate", "afterpulsing"]), ("pile_up", [])]
+    assert taken([2.0, 0.0, 1.0], alike, 1) == [("irf_tail", ["free_rate", "afterpulsing"])]
+    assert taken([0.0, 0.0, 2.0], alike, 9) == [("pile_up", [])]
     assert taken([2.0, 0.0, 1.0], alike, 0) == []
     assert taken([0.0, 0.0, 0.0], alike, 9) == []
-    names = [name for name, _ in taken([2.0, 0.0, 1.0], alike, 9, 0.5)]
-    assert (len(names), "free_rate" in names) == (2, False)
+    (first, rivals), (second, fewer) = taken([2.0, 0.0, 1.0], alike, 9, 0.5)
+    assert "free_rate" not in (first, second)
+    assert rivals[0] == "free_rate"
+    assert "free_rate" not in fewer
     for strengths, effects in (([2.0, 0.0, 1.0], False), ([0.0, 0.0, 0.0], True)):
         assert taken(strengths, alike, 9, 0.5, effects) == [("free_rate", [])]
 
@@ -540,9 +544,9 @@ def test_a_look_alike_waits_until_the_first_is_in_the_model(alike, monkeypatch):
     """Both are asked for, also beside each other; what is left of the second may be an error of the first."""
     monkeypatch.setitem(ALIKE, "time_offset", ([0.9, 0.1, 0.0], 0))
     monkeypatch.delitem(ALIKE, "afterpulsing")
-    for second in (0.0, -1.0):
+    for second, more in ((0.0, ["free_rate"]), (-1.0, [])):
         found = taken([2.0, second, 1.0], alike, 9)
-        assert found == [("irf_tail", ["time_offset"]), ("pile_up", [])]
+        assert found == [("irf_tail", [*more, "time_offset"]), ("pile_up", [])]
 
 
 def test_a_term_with_a_prior_keeps_its_scale(known):
