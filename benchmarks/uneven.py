@@ -3,7 +3,7 @@
     python benchmarks/uneven.py 2 4 21         development captures without effects, of scenes of our own
 
 The light of the true surface is put together by the surfel that is nearest to it, and fitted as the surfels'
-own light times 1 plus linear functions of the wall point. Printed are root mean squares of their coefficients,
+own light times 1 plus linear functions of the wall point. Printed are root mean squares of coefficients,
 weighted by light, over groups of surfels that lie together; then what the counts alone ask for, of 32 groups,
 which is what the pool reckons with (docs/notebook.md).
 """

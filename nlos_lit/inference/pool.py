@@ -88,8 +88,8 @@ class Taken:
     Args:
         candidate: as the linear problem sees it beside those that were taken before it.
         rivals: terms of its kind that were asked for until it was taken, and have less than half of their
-            evidence beside it; most evidence first. Before them, if it is an effect and the first to be taken,
-            the free term with most evidence, if it has more.
+            evidence beside it; most evidence first. Before them, where it is an effect and the first that is
+            taken, the free term with most evidence, if it has more.
     """
 
     candidate: Candidate

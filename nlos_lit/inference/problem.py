@@ -405,7 +405,7 @@ def towards_wall(model: SurfelModel) -> Tensor:
     points = [p[:, :2] for p in (model.sensor, model.laser) if float((p - p[:1]).abs().max()) > 0]
     if len(points) == 2 and torch.equal(*points):
         points = points[:1]
-    found = []
+    found = list[Tensor]()
     for p in points:
         found += (p - p.mean(0)).unbind(1)
     functions = torch.stack(found, 1)

@@ -232,8 +232,8 @@ def gained(name: str, nats: float, weight: float = 0.01) -> Trial:
 
 
 def test_the_simplest_of_the_terms_that_gain_most():
-    """Nine tenths of the best gain, or a quarter of its weight, are enough for fewer coefficients; a quarter of
-    its weight for an effect beside a free term.
+    """Nine tenths of the best gain, or a quarter of its weight, are enough for fewer coefficients; a quarter
+    of its weight for an effect beside a free term.
     """
 
     def name(*trials: Trial) -> str:
