@@ -367,7 +367,7 @@ class Loop:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
-        effects must be asked for beside such a scene when it has become fine.
+        effects must be asked for as much as they need beside such a scene when it has become fine.
         """
         names = [m.name for m in members]
         value, found = log_likelihood(coarse, self.split.select), []
@@ -388,7 +388,7 @@ class Loop:
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
                 evidence = self._beside(fine, member.name, kept)
-                now = now if evidence > self.least else replace(now, evidence=evidence, needed=self.least)
+                now = replace(now, evidence=min(evidence, now.evidence))
             found.append(replace(member, confirmed=now, accepted=now.holds(free)))
         return found
 

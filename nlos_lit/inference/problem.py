@@ -128,9 +128,10 @@ def build_problem(
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
         whole = _Forward(model, extension, partial(_render, part))
-        alike = {"roll": model.roll} | ({"raw_opacity": model.raw_opacity} if len(model.hiders) else {})
-        for name, p in alike.items():
-            both.append(_jvp(whole, f"model.{name}", p.detach(), torch.ones_like(p)))
+        does = {"roll": bool(model.outward.any()), "raw_opacity": len(model.hiders) > 0}
+        for name in (n for n, some in does.items() if some):
+            p = getattr(model, name).detach()
+            both.append(_jvp(whole, f"model.{name}", p, torch.ones_like(p)))
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]

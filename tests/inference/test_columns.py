@@ -149,7 +149,7 @@ def test_patches_look_uneven_from_the_wall():
         assert torch.allclose(towards.square().mean(0), torch.ones(number, dtype=towards.dtype))
         problem = build_problem(model, extension, spots, torch.zeros(4, 58))
         assert problem.uneven.shape == (4 * 58, 32 * number)
-        assert torch.equal(problem.prior, torch.zeros(2 * m + 32 * 2 + 6))
+        assert torch.equal(problem.prior, torch.zeros(2 * m + 32 * 2 + 5))
 
 
 def test_batches_of_spots_change_nothing(monkeypatch):
