@@ -439,11 +439,16 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
 
 @pytest.mark.parametrize("name", ["retroreflection", "free_time", "timing_jitter"])
 @pytest.mark.parametrize(("over", "accepted"), [(-0.1, False), (0.1, True)])
-def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(monkeypatch, name, over, accepted):
-    """Wide cells may ask for what a finer scene does by itself. Free terms claim no cause; single spots have
-    over their neighbours what no scene can give them.
+@pytest.mark.parametrize("misfit", [0.0, 100.0])
+def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(
+    monkeypatch, name, over, accepted, misfit
+):
+    """As much as beside the scene with it. Wide cells may ask for what a finer scene does by itself. Free
+    terms claim no cause; single spots have over their neighbours what no scene can give them.
     """
-    world = World(monkeypatch, {name: nats(70.0)}, [candidate(name)], when_fine={name: LEAST + over})
+    needed = LEAST + SETTINGS.share * misfit
+    table, when_fine = {name: nats(70.0)}, {name: needed + over}
+    world = World(monkeypatch, table, [candidate(name)], misfit=misfit, when_fine=when_fine)
     scenes = fitted(name, fine=True), fitted(name)
     (found,), scene, _ = world.loop().hold(
         [Member(world.pool[0])], *scenes, Held([], fitted(fine=True), fitted())
@@ -451,7 +456,8 @@ def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(monkeypatch,
     accepted = accepted or name != "retroreflection"
     assert (found.accepted, scene.names) == (accepted, {name} if accepted else set())
     if not accepted:
-        assert (found.confirmed.evidence, found.confirmed.needed) == (pytest.approx(LEAST - 0.1), LEAST)
+        told = found.confirmed.evidence, found.confirmed.needed
+        assert told == pytest.approx((needed - 0.1, needed))
 
 
 def test_the_scene_is_built_anew_with_those_that_stay(monkeypatch):
