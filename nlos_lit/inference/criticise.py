@@ -567,7 +567,8 @@ class Loop:
         """
         s = self.settings
         itself, none = member.trials
-        rivals = list(member.rivals[: s.rivals])
+        have = {e.name for e in none.fit.extension.effects}  # those that came since and hold beside it
+        rivals = [c for c in member.rivals if c.name not in have][: s.rivals]
         jobs = [
             (
                 f"going on with {c.name} for {member.name}",

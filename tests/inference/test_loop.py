@@ -572,6 +572,16 @@ def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
     assert {t.name for t in member.trials} == {"wall_reflectance", "hum", "pile_up", "none"}, "two rivals"
 
 
+def test_a_rival_that_holds_beside_a_term_does_not_take_its_place(monkeypatch):
+    """It waited until the term was in the model, was asked for again and came; it is there once."""
+    table = {"wall_reflectance": nats(50.0), "vignetting": nats(60.0)}
+    pool, rivals = [candidate(n) for n in table], {"wall_reflectance": ["vignetting"]}
+    world = World(monkeypatch, table, pool, beside={"vignetting": {"wall_reflectance"}}, rivals=rivals)
+    found = world.criticise()
+    assert [m.name for m in found.accepted] == ["wall_reflectance", "vignetting"]
+    assert {t.name for t in found.accepted[0].trials} == {"wall_reflectance", "none"}
+
+
 def test_a_simpler_rival_takes_the_place_of_a_term(monkeypatch):
     """Where it gains as much; the others stay as they are."""
     table = {"wall_reflectance": nats(50.0), "vignetting": nats(49.0), "irf_tail": nats(60.0)}
