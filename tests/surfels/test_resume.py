@@ -116,7 +116,7 @@ def test_a_state_is_a_copy():
 
 def test_rates_fall_within_a_round_and_the_last_cools_down():
     fit = begun()
-    fit.schedule([Round(4, left=1, settling=True), Round(8)])
+    fit.schedule([Round(4, left=1, settling=True), Round(8, outline=True)])
     rates = []
     while not fit.finished:
         if not fit.in_round:
@@ -126,9 +126,9 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
         if fit.round_done:
             fit.end_round()
     first, last = np.array(rates[:4]), np.array(rates[4:])
+    waiting = [0.08, 0.1, 0.15, 0.2, 0.3 * 0.03]  # the response, and how far rims roll off
     highest = [0.08, 0.1, 0.15, 0.2, 0.05, 0.03]
-    slow = [1, 1, 1, 1, 1, 0.3]  # the response waits
-    assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, np.multiply(highest, slow)))
+    assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, waiting))
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 
 

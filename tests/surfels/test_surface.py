@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from data_modules.simulate import ScanPlan, SensorModel, join, simulate_capture
-from data_modules.simulate.scenes import plate, sphere
+from data_modules.simulate.bodies import Torus
+from data_modules.simulate.scenes import plate
 from data_modules.spots import heldout_mask
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
@@ -596,13 +597,23 @@ def test_rims_lean_outwards(fitted):
 
 
 def test_how_far_rims_roll_off_is_found(fitted):
-    """Plates end; a ball turns away from the wall within a cell, and is darker from straight ahead."""
+    """Plates end; a torus turns away from the wall within a cell, and spots that no fit has seen are
+    predicted better by that.
+    """
     assert abs(fitted[-1].model.roll) < 0.05
     scan = ScanPlan(kind="confocal", nx=20, ny=20, width=1.0, n_bins=190, bin_length=BIN, t_start=0.6)
     sensor = SensorModel(sigma=1.0 * BIN, kappa=0.6 / BIN, background=0.15, mean_counts=1500)
-    capture, _ = simulate_capture(sphere((0.05, 0.0, 0.6), 0.15), scan, sensor, seed=2)
-    spots = np.arange(400)
-    assert fit_surfels(capture, *image(capture), QUICK, spots, seed=0).model.roll > 0.15
+    torus = Torus(radius=0.14, tube=0.06, at=(0.05, 0.0, 0.6)).mesh()
+    capture, _ = simulate_capture(torus, scan, sensor, seed=2)
+    held = heldout_mask(capture, 3, 4)
+    train, scored = np.flatnonzero(~held), np.flatnonzero(held)
+    free, kept = (
+        fit_surfels(capture, *image(capture), settings, train, seed=0, heldout_spots=scored)
+        for settings in (QUICK, dataclasses.replace(QUICK, roll_rate=1e-9))
+    )
+    assert free.model.roll > 0.15
+    assert abs(kept.model.roll) < 1e-6
+    assert free.heldout.deviance_per_bin < kept.heldout.deviance_per_bin
 
 
 def test_a_sheet_that_is_laid_as_it_is_begins_with_its_own_normals(fitted):
