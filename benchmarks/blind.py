@@ -199,12 +199,8 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     ]
 
 
-def table(cases: list[dict]) -> str:
-    """All rows of a set as Markdown."""
-    out = ["| what | asked for | measured (95 % interval) |", "|---|---|---|"]
-    out += [f"| {what} | {asked} | {value} |" for what, asked, value in rows_of(cases)]
-    seconds = sum(c["seconds"] for c in cases)
-    out += ["", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each.", ""]
+def captures(cases: list[dict]) -> str:
+    """One line a capture as Markdown."""
     heads = (
         "no.",
         "scene",
@@ -217,34 +213,66 @@ def table(cases: list[dict]) -> str:
         "base / noise",
         "after / noise",
         "s",
+        "commit",
     )
-    out += ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for c in cases:
+    out = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    for c in sorted(cases, key=lambda c: c["index"]):
         hidden = ", ".join(f"{n} ({s[1]:.0f})" for n, s in c["statistics"].items()) or "nothing"
         said = ", ".join("/".join(group) for group in c["named"]) or ("failed" if c["error"] else "–")
         noise = c["noise"] or float("nan")
         cells = (
             c["index"], c["spec"]["family"], c["spec"]["scan"], f"{c['spec']['level']:g}", hidden, said,
             ", ".join(c.get("likely", ())) or "–", ", ".join(c["unknown"]) or "–",
-            f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}", f"{c['seconds']:.0f}",
+            f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}", f"{c['seconds']:.0f}", c["commit"],
         )  # fmt: skip
         out.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(out)
+
+
+def rates(cases: list[dict]) -> str:
+    """What was asked for and measured on one look, as Markdown."""
+    out = ["| what | asked for | measured (95 % interval) |", "|---|---|---|"]
+    out += [f"| {what} | {asked} | {value} |" for what, asked, value in rows_of(cases)]
+    seconds = sum(c["seconds"] for c in cases)
+    return "\n".join([*out, "", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each."])
+
+
+def looks_of(cases: list[dict]) -> dict[str, list[dict]]:
+    """Captures by the commit that they were run at, the last look first."""
+    by: dict[str, list[dict]] = defaultdict(list)
+    for case in cases:
+        by[case["commit"]].append(case)
+    return dict(reversed(by.items()))
+
+
+def side_by_side(looks: dict[str, list[dict]]) -> str:
+    """All looks as Markdown: what was measured in a line each, a look a column, without intervals."""
+    spans = [f"{min(c['index'] for c in rows)} – {max(c['index'] for c in rows)}" for rows in looks.values()]
+    out = ["| what | " + " | ".join(spans) + " |", "|---" * (len(looks) + 1) + "|"]
+    columns = [[value.split(" =")[0] for _, _, value in rows_of(rows)] for rows in looks.values()]
+    whats = [what for what, _, _ in rows_of([])]
+    out += [f"| {what} | " + " | ".join(line) + " |" for what, *line in zip(whats, *columns, strict=True)]
+    out.append("| commit | " + " | ".join(looks) + " |")
     return "\n".join(out)
 
 
 def report() -> None:
     """Rewrite the tables of docs/blind.md."""
     cases = [json.loads(text) for text in ROWS.read_text().splitlines()]
-    parts = []
-    for name in ("test", "validation", "development"):
-        looks = defaultdict(list)
-        for case in cases:
-            if case["set_name"] == name:
-                looks[case["commit"]].append(case)
-        for when, rows in reversed(looks.items()):
-            rows.sort(key=lambda c: c["index"])
-            span = f"{rows[0]['index']} to {rows[-1]['index']}"
-            parts.append(f"## The {name} set, numbers {span}, at commit {when}\n\n{table(rows)}\n")
+    test, validation, development = (
+        [c for c in cases if c["set_name"] == name] for name in ("test", "validation", "development")
+    )
+    looks = looks_of(validation)
+    newest = {c["index"]: c for c in development}
+    parts = [f"## The test set\n\n{rates(test)}\n\n{captures(test)}\n"] if test else []
+    parts += [f"## The last look at the validation set\n\n{rates(next(iter(looks.values())))}\n"]
+    parts += [f"## All looks at the validation set, the last first\n\n{side_by_side(looks)}\n"]
+    parts += [f"## Captures of the validation set\n\n{captures(validation)}\n"]
+    parts += [
+        "## Captures of the development set, as they were last run\n\n"
+        "No rates: rules were chosen on these captures. Rows of earlier commits are in\n"
+        f"[blind_rows.jsonl](blind_rows.jsonl).\n\n{captures(list(newest.values()))}\n"
+    ]
     page = ROOT / "docs" / "blind.md"
     head = page.read_text().split(MARK)[0]
     page.write_text(head + MARK + "\n\n" + "\n".join(parts))

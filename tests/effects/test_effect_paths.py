@@ -26,6 +26,23 @@ def test_retroreflection_turns_the_fourth_power_into_the_second():
     assert grazing.path(ONE, hand_paths(1, 2, 0.25, 0.64), SPOT).item() == pytest.approx(2.5, rel=1e-5)
 
 
+def test_retroreflecting_sheeting_sends_back_less_of_what_enters_at_an_angle():
+    sheeting = effect("retroreflection", falloff=4.0, cosine=1.0, entrance=5.0)
+
+    def kept(degrees: float) -> float:
+        cosine = math.cos(math.radians(degrees))
+        return sheeting.path(ONE, hand_paths(1, 1, cosine, cosine), SPOT).item()
+
+    # tan⁴ 30° = 1/9: beside the cos² of the base 0.75 · e^(-5/9) = 0.43, as type I sheeting keeps at least.
+    assert kept(30) == pytest.approx(math.exp(-5 / 9), rel=1e-5)
+    assert 0.75 * kept(30) == pytest.approx(30 / 70, abs=0.002)
+    assert kept(0) == 1.0
+    assert kept(45) == pytest.approx(math.exp(-5), rel=1e-4)
+    # From 60° on, tan² = 3, nothing is lost any more.
+    assert kept(60) == pytest.approx(math.exp(-45), rel=1e-3)
+    assert kept(80) == pytest.approx(math.exp(-45), rel=1e-3)
+
+
 def test_specular_lobe_peaks_along_the_mirror_direction():
     # Wall points at x = ±0.75, surfel at depth 1 facing the wall: the half vector is the normal.
     scan = hand_scan([[-0.75, 0, 0]], [[0.75, 0, 0]])

@@ -42,7 +42,7 @@ ACCEPTED = {
     "none": {},
     "gain and pile-up": {"vignetting": {"strength": 0.3}, "pile_up": {"detections": 0.5}},
     "falloff, tail and background": {
-        "retroreflection": {"falloff": 3.2, "cosine": 0.7},
+        "retroreflection": {"falloff": 3.2, "cosine": 0.7, "entrance": 0.5},
         "irf_tail": {"fraction": 0.2, "decay": 0.15},
         "background_slope": {"slope": 0.5},
     },

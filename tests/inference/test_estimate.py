@@ -388,10 +388,15 @@ def test_screened_in_units_of_the_parameters():
     assert found.detectable["fraction"] == pytest.approx((visible_score(8.3) + 1.2816) * 0.05 * 0.3)
     assert (found.degrees, found.shape, found.evidence) == (1, {"decay": 0.11}, 30)
     retro = effect_of("retroreflection", SCAN)
-    found = _screened(Candidate(retro, 9.0, 0.4, 1.0, {}, torch.tensor([-1.0, 0.5]), torch.ones(2), 9.0), 8.3)
+    step = torch.tensor([-1.0, 0.5, 2.0])
+    found = _screened(Candidate(retro, 9.0, 0.4, 1.0, {}, step, torch.ones(3), 9.0), 8.3)
     scale = {p.name: p.scale for p in retro.amplitudes}
     assert found.one_step == pytest.approx(
-        {"falloff": 4 - scale["falloff"], "cosine": 1 + 0.5 * scale["cosine"]}
+        {
+            "falloff": 4 - scale["falloff"],
+            "cosine": 1 + 0.5 * scale["cosine"],
+            "entrance": 2 * scale["entrance"],
+        }
     )
     drift = effect_of("power_drift", SCAN)
     found = _screened(
