@@ -123,7 +123,7 @@ def test_nuisance_is_the_slope_of_the_render(kind, accepted):
     assert torch.allclose(uneven, everywhere * towards[:, None, None, :], rtol=1e-9)
     assert ours.shape == (4 * 58, len(changes))
     for k, change in enumerate(changes):
-        rounded = k >= 4 * m
+        rounded = k >= 4 * m and k != 4 * m + 4  # rims roll off in the tracing, exactly
         numeric = slope(model, extension, spots, change, ROUGH if rounded else FINE)
         assert float(numeric.abs().max()) > 0, f"column {k} is nothing"
         tolerance = (1e-3 if rounded else 2e-5) * float(numeric.abs().max())
