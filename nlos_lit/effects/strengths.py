@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterable, Mapping
 
@@ -68,3 +69,30 @@ def report(effects: Iterable[Effect]) -> dict[str, dict[str, dict[str, float | s
         e.name: {name: {"value": float(q.value), "unit": q.unit} for name, q in e.quantities().items()}
         for e in effects
     }
+
+
+@torch.no_grad()
+def bound_notes(effects: Iterable[Effect]) -> list[str]:
+    """Sentences on parameters that were fitted and lie at a bound, where the effect is not absent.
+
+    What the counts ask for lies beyond: the effect's law may be another one than its equation.
+
+    Args:
+        effects: as they were fitted.
+
+    Returns:
+        One for each such parameter.
+    """
+    notes = []
+    for effect in effects:
+        for p in effect.declared.values():
+            ends = {end: word for end, word in ((p.lower, "least"), (p.upper, "most")) if end != p.null}
+            # Stored in single precision, as multiples of the scale or as the logarithm of them.
+            value = effect.value(p.name)
+            at = [end for end in ends if p.size == 1 and math.isclose(float(value), end, rel_tol=1e-4)]
+            notes += [
+                f"{p.name} of {effect.name} is {end:g}, the {ends[end]} that it may be: what the counts ask "
+                "for lies beyond, so that its equation may be another one than what acts"
+                for end in at
+            ]
+    return notes

@@ -16,6 +16,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
+from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
 from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.distil import Follower, laid_through
@@ -104,7 +105,7 @@ def assemble(
         chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
         if null is None
         else null.chance(largest),
-        notes=[],
+        notes=bound_notes(final.extension.effects),
         capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,

@@ -18,7 +18,7 @@ from nlos_lit.capture.foreign import archived
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.strengths import report
+from nlos_lit.effects.strengths import bound_notes, report
 from nlos_lit.io.files import write_depth
 from nlos_lit.io.meshes import write_mesh
 from nlos_lit.io.points import write_points
@@ -94,7 +94,8 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
 
     Returns:
         The summary's entry: scores on all held-out spots, what they leave above noise (None without photon
-        statistics), imaging parameters, effects, geometry errors where truth is known.
+        statistics), imaging parameters, effects and which of their numbers lie at a bound, geometry errors
+        where truth is known.
     """
     capture, export = run.capture, run.config["export"]
     found = fitted_surfels(module.fit, run.data.heldout_spots, began)
@@ -117,13 +118,15 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
     assert found.heldout is not None  # held-out spots were given
     excess = heldout_excess(run, found) if capture.is_counts else None
     note = None if excess is None else excess_note(excess, place.parent)
-    if note is not None:
-        log.info(note)
+    bounds = bound_notes(found.extension.effects)
+    for said in bounds if note is None else [note, *bounds]:
+        log.info(said)
     return {
         "surfels": len(found.model),
         "heldout": dataclasses.asdict(found.heldout),
         "excess": None if excess is None else dataclasses.asdict(excess),
         "note": note,
+        "at_bounds": bounds,
         "parameters": {
             name: {"value": value, "unit": unit} for name, (value, unit) in found.parameters.items()
         },

@@ -9,13 +9,14 @@ import math
 import numpy as np
 import pytest
 import torch
-from effect_contract import BIN, GATE, SPOTS, capture, scene
+from effect_contract import BIN, GATE, SPOTS, capture, registered, scene
 from effect_hand import SPOT, effect, hand_scan
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.scan_pieces import lines
+from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
 
 FIRST, LAST = GATE
@@ -417,3 +418,20 @@ def test_one_spot_is_enough():
     scan = Scan.of(alone)
     for built in EFFECTS:
         assert built(scan).quantities() is not None
+
+
+def test_numbers_that_lie_at_a_bound_are_told():
+    """Not those at their null, even where that is a bound (an entrance loss of 0)."""
+    assert bound_notes([effect("retroreflection"), effect("irf_tail"), effect("wall_reflectance")]) == []
+    inside = effect("retroreflection", falloff=1.51, cosine=2.99, entrance=7.9)
+    assert bound_notes([inside]) == []
+    beyond = effect("retroreflection", falloff=1.0, cosine=9.0, entrance=0.0)
+    said = [note.split(":")[0] for note in bound_notes([beyond])]
+    assert said == [
+        "falloff of retroreflection is 1.5, the least that it may be",
+        "cosine of retroreflection is 3, the most that it may be",
+    ]
+    scan = scene("confocal")[1]
+    decay = next(p for p in registered("irf_tail").declare(scan) if p.name == "decay")
+    (slow,) = bound_notes([effect("irf_tail", fraction=0.1, decay=10 * decay.upper)])
+    assert slow.startswith(f"decay of irf_tail is {decay.upper:g}, the most")

@@ -4,6 +4,7 @@ makes of them.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -295,6 +296,15 @@ def test_what_is_said_of_accepted_terms(findings):
         found, members=[*found.members[:2], dataclasses.replace(last, confirmed=better)]
     )
     assert diagnosed((told, *findings[1:])).likely == [Likely("afterpulsing", 40.0, 1.0, 0.38, 220.0, 671.0)]
+
+
+@FORWARD_MODE
+def test_a_number_at_its_bound_is_in_the_notes(findings):
+    found = copy.deepcopy(findings[0])
+    assert diagnosed((found, *findings[1:])).notes == []
+    found.final.extension.effects[0].set("decay", 1e9)
+    (note,) = diagnosed((found, *findings[1:])).notes
+    assert note.startswith("decay of irf_tail is ")
 
 
 @FORWARD_MODE

@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.commands.train import surface_settings
+from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.io.points import read_points
 from nlos_lit.metrics.excess import Excess
 from nlos_lit.model.parameters import BoundedParameter
@@ -246,6 +247,7 @@ def test_the_door_leaves_a_surface(finished):
     assert len(read_points(place / "points.ply")) == refined["surfels"]
     model, extension = load_refined(finished, prepare_run(compose("train", SMALL)).capture)
     assert (len(model), len(extension.effects)) == (refined["surfels"], 2)
+    assert refined["at_bounds"] == bound_notes(extension.effects)
 
 
 def test_events_hold_the_way_of_the_surface(finished):
