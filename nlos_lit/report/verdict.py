@@ -120,7 +120,9 @@ def verdict(diagnosis: Diagnosis, listed: bool = True) -> str:
 
 def _found(diagnosis: Diagnosis, listed: bool) -> str:
     found, share = missing(diagnosis), misfit(diagnosis).share
-    said = "" if share is None else f"{percent(min(share, 1.0))} of the excess misfit"
+    said = ""
+    if share is not None:
+        said = f"{percent(min(share, 1.0)) if share > 0 else 'none'} of the excess misfit"
     if not found:
         if not diagnosis.unknown:
             return _nothing(diagnosis)

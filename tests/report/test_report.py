@@ -175,6 +175,11 @@ def test_the_verdict_on_one_effect():
     assert verdict(one) == f"{tail}; modelling it explains 72 % of the excess misfit."
     # without untouched spots: (1.2417 - 0.9402) = 0.3015, (1.0351 - 0.9251) = 0.11: 64 %
     assert "64 % of" in verdict(dataclasses.replace(one, untouched_test={}))
+    # What predicts untouched spots worse explains nothing, not -10 %: 0.396 above noise instead of 0.36.
+    worse = {**one.untouched_test, "extended": Scores(1.326, 0.93, 0.02, 0.015)}
+    assert verdict(dataclasses.replace(one, untouched_test=worse)) == (
+        f"{tail}; modelling it explains none of the excess misfit."
+    )
     unknown_size = dataclasses.replace(TAIL_ALONE, parameters={})
     assert verdict(two_found(effects=[unknown_size], groups=[])).startswith(
         "Your simulation misses a slow detector tail; modelling it"
