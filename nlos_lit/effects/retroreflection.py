@@ -43,7 +43,7 @@ class Retroreflection(Effect):
     words = EffectWords(
         phrase="a retroreflecting hidden surface",
         cause="The surface sends light back to where it came from (tape, signs, safety vests): brightness "
-        "falls more slowly with distance and hardly with the angle.",
+        "falls more slowly with distance, and otherwise with the angle.",
         remedy="Cover the retroreflective parts, or keep the fitted exponents; a non-confocal scan is far "
         "less sensitive to it.",
         headline="falloff exponent {falloff} instead of 4, cosine exponent {cosine} instead of 1, "

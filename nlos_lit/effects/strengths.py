@@ -73,7 +73,7 @@ def report(effects: Iterable[Effect]) -> dict[str, dict[str, dict[str, float | s
 
 @torch.no_grad()
 def bound_notes(effects: Iterable[Effect]) -> list[str]:
-    """Sentences on parameters that were fitted and lie at a bound, where the effect is not absent.
+    """Sentences on fitted parameters that lie at a bound which is not their null.
 
     What the counts ask for lies beyond: the effect's law may be another one than its equation.
 
@@ -85,14 +85,13 @@ def bound_notes(effects: Iterable[Effect]) -> list[str]:
     """
     notes = []
     for effect in effects:
-        for p in effect.declared.values():
-            ends = {end: word for end, word in ((p.lower, "least"), (p.upper, "most")) if end != p.null}
-            # Stored in single precision, as multiples of the scale or as the logarithm of them.
-            value = effect.value(p.name)
-            at = [end for end in ends if p.size == 1 and math.isclose(float(value), end, rel_tol=1e-4)]
-            notes += [
-                f"{p.name} of {effect.name} is {end:g}, the {ends[end]} that it may be: what the counts ask "
-                "for lies beyond, so that its equation may be another one than what acts"
-                for end in at
-            ]
+        for p in (p for p in effect.declared.values() if p.size == 1):
+            value = float(effect.value(p.name))
+            for end, word in ((p.lower, "least"), (p.upper, "most")):
+                # Stored in single precision, as multiples of the scale or as the logarithm of them.
+                if end != p.null and math.isclose(value, end, rel_tol=1e-4):
+                    notes.append(
+                        f"{p.name} of {effect.name} is {end:g}, the {word} that it may be: what the counts "
+                        "ask for lies beyond, so that its equation may be another one than what acts"
+                    )
     return notes
