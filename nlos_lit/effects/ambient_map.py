@@ -36,6 +36,7 @@ class AmbientMap(SmoothEffect):
         headline="{rms} rms over the wall",
     )
     coefficients = "level_map"
+    imitated = True
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

@@ -47,6 +47,8 @@ class Effect(nn.Module, Hooks):
             over its neighbours counts.
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
             it with the same values.
+        imitated: real captures have it strongly, and a scene fitted without it imitates it by surfels. A
+            diagnosis also builds a scene with all such effects from the first surfel on.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
@@ -62,6 +64,7 @@ class Effect(nn.Module, Hooks):
     in_runs: ClassVar[bool] = False
     lasting: ClassVar[bool] = False
     with_power: ClassVar[tuple[str, ...]] = ()
+    imitated: ClassVar[bool] = False
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False

@@ -38,6 +38,7 @@ class IrfTail(Effect):
         headline="{fraction} of the photons, τ = {decay}",
     )
     witness = "tail"
+    imitated = True
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

@@ -38,6 +38,7 @@ class WallReflectance(SmoothEffect):
     )
     witness = "energy"
     coefficients = "gain_map"
+    imitated = True
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

@@ -25,7 +25,17 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood, score, weights
-from nlos_lit.inference.members import EVEN, Confirmed, Findings, Member, Trial, chosen, group_of, weighed
+from nlos_lit.inference.members import (
+    EVEN,
+    SURE,
+    Confirmed,
+    Findings,
+    Member,
+    Trial,
+    chosen,
+    group_of,
+    weighed,
+)
 from nlos_lit.inference.per_spot import solve
 from nlos_lit.inference.pool import Candidate, Pool, ask, own_evidence
 from nlos_lit.inference.problem import acting_order
@@ -38,7 +48,9 @@ Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
+HALF = 0.5  # of the misfit that a fine scene leaves without an effect
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
+IMITATED = frozenset(cls.name for cls in EFFECTS if cls.imitated)
 
 
 @dataclass(frozen=True)
@@ -222,6 +234,53 @@ class Loop:
         text = "asking single spots" if of_spots else "asking the pool"
         return self.steps("screen", f"{text}, {self.number}", f"pool{self.number}", asking)
 
+    def begun(self, base: SurfelFit, fine: SurfelFit, pool: Pool) -> tuple[SurfelFit, list[Member]]:
+        """The parsimonious scene that the search begins with.
+
+        Beside a scene that has imitated a strong effect the counts do not ask for that any more. So a scene
+        is also built with all effects that scenes imitate, at their nulls, from the first surfel on. It is
+        taken where it surely predicts better than the fine scene without any, which has more surfels. Where
+        there are no such effects they are a burden.
+
+        Args:
+            base: without effects, parsimonious.
+            fine: the same scene as fine as the counts ask for.
+            pool: what the counts ask for beside the base.
+
+        Returns:
+            the scene, and the effects that it has.
+        """
+        members = [Member(c) for c in pool.candidates if c.name in IMITATED]
+        if not members:
+            return base, []
+        effects = [copy.deepcopy(m.candidate.effect) for m in members]
+        for effect in effects:
+            effect.reset()
+            effect.requires_grad_(True)
+        text = f"building a scene with {', '.join(e.name for e in effects)}"
+        make = partial(self._or_base, base, copy_effects(Extension([]), effects))
+        fit = self.steps("fit", text, "begun", make)
+        return (fit, members) if fit.extension.effects and self.predicts(fit, fine, SURE) else (base, [])
+
+    def lost(self, before: Pool, now: Pool) -> list[Candidate]:
+        """What the counts asked for before terms came, and have lost more than half of their evidence since.
+
+        Args:
+            before: pool beside the scene without the terms.
+            now: beside the scene with them.
+
+        Returns:
+            what may be meant instead, most evidence first; nothing with a number for each spot.
+        """
+        left = {c.name: c.evidence for c in now.candidates}
+        known = [c for c in before.candidates if c.name in left and not c.effect.per_spot]
+        return [c for c in known if c.evidence > max(self.least, 2 * left[c.name])]
+
+    def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
+        """A scene built with the effects, or the base, where no surfel survives with them."""
+        fit = _rebuilt(self.rebuild, extension, self.seed)
+        return base if fit is None else fit
+
     def next(self, pool: Pool, free: bool) -> list[Member]:
         """Who comes into the parsimonious scene.
 
@@ -306,7 +365,8 @@ class Loop:
         one after the other, each asked when those before it are gone, and free terms beside the effects that
         are left; else the one that is missed least leaves. The scene has bent itself to those that left: it
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
-        parsimonious scenes.
+        parsimonious scenes. Effects that are likely stay in the scene, unless one that fails would hold
+        without them: what they explain would stand against all others as misfit.
 
         Args:
             members: whose terms the scene has.
@@ -317,20 +377,22 @@ class Loop:
 
         Returns:
             The same members, accepted or not, with none and itself as trials where they are, and both scenes
-            without those that left.
+            with those that stay.
         """
         staying, left = list(members), dict[str, Member]()
         while staying:
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            if coarse is not None and all(m.accepted for m in staying):
-                staying = self._anew(staying, coarse)
-            failing = [m for m in staying if not m.accepted]
+            if coarse is not None and all(m.stays for m in staying):
+                staying = self._anew(staying, coarse, scene)
+            failing = [m for m in staying if not m.stays]
             if not failing:
                 break
             gone = [m for m in failing if m.name not in enough]
+            if not gone:  # without those that are likely they would have enough
+                gone = [m for m in staying if m.likely and m.name not in enough]
             gone = gone or [min(failing, key=_gain)]
-            left |= {m.name: m for m in gone}
+            left |= {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
             if coarse is None or before is None:
                 scene = self._bare(scene, gone, asked)
@@ -363,14 +425,26 @@ class Loop:
             return next(fit for member, fit in asked if member.name == names[0])
         return self._parted(scene, names, f"left{self.number}_{'_'.join(names)}")
 
-    def _anew(self, members: list[Member], coarse: SurfelFit) -> list[Member]:
+    def _anew(self, members: list[Member], coarse: SurfelFit, scene: SurfelFit) -> list[Member]:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
-        effects must be asked for as much as they need beside such a scene when it has become fine.
+        effects must be asked for as much as they need beside such a scene when it has become fine. Not those
+        with more evidence than half of the misfit that this leaves, if they also predict other spots much
+        better: beside a scene that imitates a strong one the counts ask for it no more, and no misfit of
+        unknown kind looks so much like one effect.
+
+        Args:
+            members: that hold or are likely.
+            coarse: the parsimonious scene with all of them.
+            scene: the one that they hold beside.
+
+        Returns:
+            the same members.
         """
         names = [m.name for m in members]
-        value, found = log_likelihood(coarse, self.split.select), []
+        value, whole = (log_likelihood(fit, self.split.select) for fit in (coarse, scene))
+        found = []
         self.steps.plan(fit=len(names))
         for member in members:
             kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
@@ -387,8 +461,11 @@ class Loop:
             if now.holds(free) and not free and not per_spot:
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
-                evidence = self._beside(fine, member.name, kept)
-                now = replace(now, evidence=min(evidence, now.evidence))
+                strong = now.evidence > HALF * self._misfit(fine)
+                gained = self._gained(fine, log_likelihood(fine, self.split.select), whole)
+                if not (strong and Confirmed(now.evidence, now.needed, *gained).much):
+                    evidence = self._beside(fine, member.name, kept)
+                    now = replace(now, evidence=min(evidence, now.evidence))
             found.append(replace(member, confirmed=now, accepted=now.holds(free)))
         return found
 
@@ -473,7 +550,7 @@ class Loop:
             staying = [m for m in members if m.accepted] + [Member(new[0])]
             with_it = self.better(self._solved(scene, new[0]), self.gone_on(scene, new[:1]))
             staying, with_it, _ = self.hold(staying, with_it)
-            if not staying[-1].accepted:
+            if not staying[-1].stays:
                 return [*members, staying[-1]], scene
             now = {m.name: m for m in staying}
             members, scene = [now.get(m.name, m) for m in members] + staying[-1:], with_it
@@ -483,18 +560,19 @@ class Loop:
         text, kept = f"solving for {new.name}", f"solved{self.number}_{new.name}"
         return self.steps("fit", text, kept, lambda: solve_spots(fit.copy(begun_with(fit, [new]), self.seed)))
 
-    def predicts(self, scene: SurfelFit, other: SurfelFit) -> bool:
+    def predicts(self, scene: SurfelFit, other: SurfelFit, least: float = EVEN) -> bool:
         """Which of two scenes predicts the select spots better.
 
         Args:
             scene: one.
             other: another.
+            least: weight from which on it counts.
 
         Returns:
-            Whether it is the first, in more than half of the draws of wall blocks.
+            Whether it is the first.
         """
         values = [log_likelihood(fit, self.split.select) for fit in (other, scene)]
-        return weights(values, self.block)[1] > EVEN
+        return weights(values, self.block)[1] > least
 
     def named(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """The terms that hold, each held against its rivals.
@@ -504,23 +582,35 @@ class Loop:
             scene: with those that hold.
 
         Returns:
-            The members, and the scene with what each is now.
+            The members, and the scene with what each is now. Where that has come since and holds, the member
+            leaves.
         """
-        settled = [self.settled(m) if m.accepted else m for m in members]
-        pairs = [(old.name, new) for old, new in zip(members, settled, strict=True) if old.name != new.name]
-        if not pairs:
+        have = {m.name for m in members if m.accepted}
+        settled, gone, came = list[Member](), list[str](), list[Member]()
+        for member in members:
+            now = self.settled(member) if member.accepted else member
+            if now.name != member.name:
+                gone.append(member.name)
+                if now.name in have:
+                    now = replace(member, accepted=False, gone=True)
+                else:
+                    came.append(now)
+                    have.add(now.name)
+            settled.append(now)
+        if not gone:
             return settled, scene
-        gone, came = [name for name, _ in pairs], [new for _, new in pairs]
-        bare = self._parted(scene, gone, f"bare{self.number}_{'_'.join(gone)}")
-        scene = self.gone_on(bare, [m.candidate for m in came])
+        scene = self._parted(scene, gone, f"bare{self.number}_{'_'.join(gone)}")
+        if not came:
+            return settled, scene
+        scene = self.gone_on(scene, [m.candidate for m in came])
         own, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
-        now = dict[str, Member]()
+        confirmed = dict[str, Member]()
         for member in came:
             none = next(t for t in member.trials if t.candidate is None)
             gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
             evidence, needed = own[member.name]
-            now[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained))
-        return [now.get(m.name, m) for m in settled], scene
+            confirmed[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained))
+        return [confirmed.get(m.name, m) for m in settled], scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """The same scene, gone on without all other terms.
@@ -656,8 +746,13 @@ def criticise(
         return found.pools[-1]
 
     pool = asked(effects=True)
+    coarse, new = loop.begun(base, first, pool)
+    if new:
+        before, pool = pool, asked(effects=True)
+        new = [replace(m, rivals=loop.lost(before, pool)) for m in new]
+        found.members = list(new)
+        told(first, coarse, found.members)
     for free in (False, True):
-        new = list[Member]()
         while come := loop.next(pool, free):
             coarse = loop.joined(coarse, [m.candidate for m in come])
             new, found.members = new + come, found.members + come
@@ -668,14 +763,15 @@ def criticise(
             tried, scene, left = loop.hold(new, grown, coarse, held)
             now = {m.name: m for m in tried}
             found.members = [now.get(m.name, m) for m in found.members]
-            held = Held(found.accepted, scene, left or coarse)
+            held = Held(found.present, scene, left or coarse)
         if held.coarse is not coarse and not free:
             coarse = held.coarse
             pool = asked(effects=False)
+        new = []
     found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
         found.final = scene
-        found.again = loop.only(held.coarse, [m.name for m in found.accepted])
+        found.again = loop.only(held.coarse, [m.name for m in found.present])
     else:
         found.members = [replace(m, accepted=False) for m in found.members]
     told(first, found.final, found.members)

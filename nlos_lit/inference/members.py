@@ -88,6 +88,7 @@ class Member:
         trials: what was tried in its place once it held, the largest gain first: itself, rivals, none.
         group: it and what the capture cannot tell from it, by name, with weights. A free term is none for an
             effect.
+        gone: it has left the scene.
     """
 
     candidate: Candidate
@@ -96,6 +97,7 @@ class Member:
     accepted: bool = False
     trials: list[Trial] = field(default_factory=list)
     group: dict[str, float] = field(default_factory=dict)
+    gone: bool = False
 
     @property
     def name(self) -> str:
@@ -104,7 +106,13 @@ class Member:
     @property
     def likely(self) -> bool:
         """It does not hold, although spots that were not fitted are predicted much better with it."""
-        return not self.accepted and self.confirmed is not None and self.confirmed.much
+        known = not self.accepted and not self.gone
+        return known and self.confirmed is not None and self.confirmed.much
+
+    @property
+    def stays(self) -> bool:
+        """The scene keeps its term: what is likely is no name, but all else is asked beside it."""
+        return self.accepted or self.likely
 
     @property
     def trial(self) -> Trial:
@@ -137,6 +145,11 @@ class Findings:
     def accepted(self) -> list[Member]:
         """Terms that hold."""
         return [m for m in self.members if m.accepted]
+
+    @property
+    def present(self) -> list[Member]:
+        """Terms that hold, and those that are likely, which the scenes have, too."""
+        return [m for m in self.members if m.stays]
 
 
 def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:

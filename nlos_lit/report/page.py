@@ -339,13 +339,17 @@ def _further(further: Further) -> str:
 
 def _likely(diagnosis: Diagnosis) -> str:
     """Terms that were tried and are not named, a paragraph each."""
+    kept = (
+        "it was fitted along with those that are"
+        if diagnosis.effects or diagnosis.unknown
+        else "the simulation was not extended with it"
+    )
     return "".join(
         f"<p><b>{_text(capital(describe(one.name).phrase))}</b> was tried. With it spots that were not fitted"
         f" are predicted better by {number(one.nats)} ± {number(one.error, 2)} nats: it explains"
         f" {_text(percent(one.explained))} of what they leave unexplained without it. Its own evidence is"
         f" {number(one.evidence)} nats; {number(one.needed)} are needed, since what the scene leaves"
-        " unexplained may look like it by as much. So it is not named, and the simulation was not extended"
-        " with it.</p>"
+        f" unexplained may look like it by as much. So it is not named, and {kept}.</p>"
         for one in diagnosis.likely
     )
 

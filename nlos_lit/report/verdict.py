@@ -133,15 +133,16 @@ def _found(diagnosis: Diagnosis, listed: bool) -> str:
     else:
         every = ": " + "; ".join(f"({k}) {one}" for k, one in enumerate(found, 1))
         text = f"Your simulation misses {len(found)} things{every if listed else ''}"
+    beside = " with what is likely besides" if diagnosis.likely else ""
     if not diagnosis.unknown:
         what = "it" if len(found) == 1 else "them"
-        return f"{text}; modelling {what} explains {said}." if said else f"{text}."
+        return f"{text}; modelling {what}{beside} explains {said}." if said else f"{text}."
     text += f". {_wrong(diagnosis, 'Something else')}"
     held = _held(diagnosis)
     if held is not None:
         sentence = _free_terms(diagnosis, f"{percent(held)} of the excess misfit")
         text += f"; {sentence[0].lower()}{sentence[1:]}"
-    return f"{text}. Modelling all of them explains {said}." if said else f"{text}."
+    return f"{text}. Modelling all of them{beside} explains {said}." if said else f"{text}."
 
 
 def sureness(diagnosis: Diagnosis) -> str:
