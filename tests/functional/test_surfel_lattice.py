@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from nlos_lit.functional.surfel_lattice import BACK, LAYER, TAKEN, flank, ring
+from nlos_lit.functional.surfel_lattice import BACK, LAYER, TAKEN, TURN, flank, ring
 
 UP = torch.tensor([0.0, 0.0, -1.0])
 ORIGIN, CELL = torch.zeros(2), torch.tensor([0.1, 0.1])
@@ -146,3 +146,23 @@ def test_flat_sheets_have_no_flanks_however_they_lean():
     source, cell = torch.ones(3, dtype=torch.bool), torch.tensor([0.03, 0.03])
     assert len(flank(at, normal, 0 * curvature, source, cell)[0]) == 0
     assert len(flank(at, normal, curvature, ~source, cell)[0]) == 0
+
+
+@pytest.mark.parametrize(("below", "begun"), [(0.02, 1), (-0.02, 0)])
+def test_a_patch_that_would_turn_too_far_is_too_long_for_a_flank(below, begun):
+    """From 60° on, patches are ``STEEP`` long there: the next one's middle lies one such length on."""
+    cell = 0.03
+    own = cell / math.cos(math.radians(60.0))
+    at, normal, _ = of_cylinder([60.0])
+
+    def found(radius: float) -> torch.Tensor:
+        _, _, bend = of_cylinder([60.0], radius)
+        return flank(at, normal, bend, torch.ones(1, dtype=torch.bool), torch.full((2,), cell))[1]
+
+    def turned(facing: torch.Tensor) -> float:
+        return float((facing @ normal[0]).acos())
+
+    radii = [own / TURN * (1 + 0.002 * k) for k in range(1500)]
+    edge = next(r for r in radii if len(found(r)))
+    assert turned(found(edge)) == pytest.approx(TURN, abs=0.01)
+    assert len(found(edge * (1 + below))) == begun

@@ -5,6 +5,7 @@ counts, silent on noise.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -22,7 +23,9 @@ from nlos_lit.effects import build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import Hooks
 from nlos_lit.functional.surfel_graph import (
+    CURVED,
     brightness,
+    curvature_of,
     lay_sheet,
     level_of,
     neighbour_pairs,
@@ -738,3 +741,21 @@ def test_the_counts_say_how_much_dark_surfels_hide(fitted, opacity):
     assert len(found) > 3
     assert (found - opacity).abs().max() < 0.25
     assert torch.allclose(fit.model.opacity()[hiding == 0], torch.tensor(0.5))  # they say nothing of others
+
+
+@pytest.mark.parametrize(("over", "share"), [(0.9, 1.0), (1.1, 1 / 1.1)])
+def test_no_surfel_turns_by_more_than_a_radian_from_side_to_side(over, share):
+    """What turns further is as curved as one that turns by a radian; one that turns less keeps its turn."""
+    row = torch.tensor([[-0.1, 0.0, 1.0], [0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])
+
+    def turn(angle: float) -> float:
+        a = torch.tensor([-angle, 0.0, angle])
+        facing = torch.stack([a.sin(), 0 * a, -a.cos()], 1)
+        flat = torch.tensor([0.0, 0.0, -1.0]).expand(3, 3)
+        sheet = lay_sheet(row, flat, torch.ones(3), neighbour_pairs(row, flat, 0.15), 0.1)
+        return float(curvature_of(sheet, facing, cell)[1].norm())
+
+    cell = 1.0
+    small = turn(0.01) / math.sin(0.01)  # linear in the change of the normals
+    cell = CURVED / (small * math.sin(0.3)) * over
+    assert turn(0.3) == pytest.approx(share * small * math.sin(0.3), rel=1e-4)
