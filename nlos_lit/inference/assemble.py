@@ -105,13 +105,25 @@ def assemble(
         chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
         if null is None
         else null.chance(largest),
-        notes=bound_notes(final.extension.effects),
+        notes=[*bound_notes(final.extension.effects), *_kept(found)],
         capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
         likely=_likely(found.members),
     )
+
+
+def _kept(found: Findings) -> list[str]:
+    """What is in the last model and not named."""
+    kept = [m.candidate.effect for m in found.present if not m.accepted] if found.accepted else []
+    if not kept:
+        return []
+    phrases = "; ".join(e.name if e.words is None else e.words.phrase for e in kept)
+    return [
+        "Fitted along and not named, since other spots are predicted better with it and the counts ask for it"
+        f" less than they need to: {phrases}."
+    ]
 
 
 def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Scan) -> Followed:

@@ -365,8 +365,9 @@ class Loop:
         one after the other, each asked when those before it are gone, and free terms beside the effects that
         are left; else the one that is missed least leaves. The scene has bent itself to those that left: it
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
-        parsimonious scenes. Effects that are likely stay in the scene, unless one that fails would hold
-        without them: what they explain would stand against all others as misfit.
+        parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
+        unless one that fails would hold without them: what they explain would stand against all others as
+        misfit.
 
         Args:
             members: whose terms the scene has.
@@ -389,8 +390,8 @@ class Loop:
             if not failing:
                 break
             gone = [m for m in failing if m.name not in enough]
-            if not gone:  # without those that are likely they would have enough
-                gone = [m for m in staying if m.likely and m.name not in enough]
+            if not gone:  # without those that are kept they would have enough
+                gone = [m for m in staying if not m.accepted and m.name not in enough]
             gone = gone or [min(failing, key=_gain)]
             left |= {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
@@ -435,7 +436,7 @@ class Loop:
         unknown kind looks so much like one effect.
 
         Args:
-            members: that hold or are likely.
+            members: those that hold are asked.
             coarse: the parsimonious scene with all of them.
             scene: the one that they hold beside.
 
@@ -445,8 +446,11 @@ class Loop:
         names = [m.name for m in members]
         value, whole = (log_likelihood(fit, self.split.select) for fit in (coarse, scene))
         found = []
-        self.steps.plan(fit=len(names))
+        self.steps.plan(fit=sum(m.accepted for m in members))
         for member in members:
+            if not member.accepted:
+                found.append(member)
+                continue
             kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
             make = partial(self._without_it, coarse, member.name)
             fit = self.steps("fit", f"rebuilding the scene without {member.name}", kept, make)

@@ -111,8 +111,14 @@ class Member:
 
     @property
     def stays(self) -> bool:
-        """The scene keeps its term: what is likely is no name, but all else is asked beside it."""
-        return self.accepted or self.likely
+        """The scene keeps its term: it holds, or is an effect that others are surely predicted better with.
+
+        That is no name, but what it explains would stand against all others as misfit.
+        """
+        if self.accepted or self.gone or self.confirmed is None:
+            return self.accepted
+        unnamed = not self.candidate.free and not self.candidate.effect.per_spot
+        return unnamed and self.confirmed.weight > SURE
 
     @property
     def trial(self) -> Trial:
@@ -148,7 +154,7 @@ class Findings:
 
     @property
     def present(self) -> list[Member]:
-        """Terms that hold, and those that are likely, which the scenes have, too."""
+        """Terms that hold, and effects that the scenes keep besides."""
         return [m for m in self.members if m.stays]
 
 

@@ -250,7 +250,7 @@ def findings():
     members = [
         Member(first[0], first[1:3], kept(450.0), True, [won, rival, beside, control], group),
         Member(first[2], (), kept(80.0), True, [second, control], {"free_wall": 1.0}),
-        Member(first[1], (), kept(2.0)),
+        Member(first[1], (), kept(2.0), gone=True),
     ]
     return Findings(base, final, 8.0, [Pool(first, []), Pool(first[3:], [])], members), measured, split, scan
 
@@ -373,6 +373,17 @@ def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
     assert all(asked[n] == (both[n][0], bar) for n in names)
     assert both["irf_tail"][0] < bar < alone["irf_tail"][0]
     assert own_evidence(fit, split, 48, 3, names, lambda lit, lost: 2 * alone["irf_tail"][0])[1] == []
+
+
+@FORWARD_MODE
+def test_what_the_last_model_has_without_a_name_is_in_the_notes(findings):
+    found, measured, split, scan = findings
+    sure = Confirmed(3.0, 8.0, Comparison(9.0, 2.0, (5, 13)), 1.0)
+    for weight, told in ((0.96, True), (0.94, False)):
+        kept = Member(found_candidate("ghost_pulse", scan, 9.0), (), dataclasses.replace(sure, weight=weight))
+        more = dataclasses.replace(found, members=[*found.members, kept])
+        notes = diagnosed((more, measured, split, scan)).notes
+        assert any("and not named" in n and "delayed pulse" in n for n in notes) is told
 
 
 @FORWARD_MODE
