@@ -431,9 +431,9 @@ class Loop:
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
         effects must be asked for as much as they need beside such a scene when it has become fine. Not those
-        with more evidence than half of the misfit that this leaves, if they also predict other spots much
-        better: beside a scene that imitates a strong one the counts ask for it no more, and no misfit of
-        unknown kind looks so much like one effect.
+        with more evidence than half of the misfit that this leaves, if other spots are surely predicted
+        better with them: beside a scene that imitates a strong one the counts ask for it no more, no misfit
+        of unknown kind looks so much like one effect, and cells that are too wide predict no better.
 
         Args:
             members: those that hold are asked.
@@ -444,8 +444,7 @@ class Loop:
             the same members.
         """
         names = [m.name for m in members]
-        value, whole = (log_likelihood(fit, self.split.select) for fit in (coarse, scene))
-        found = []
+        value, found = log_likelihood(coarse, self.split.select), []
         self.steps.plan(fit=sum(m.accepted for m in members))
         for member in members:
             if not member.accepted:
@@ -466,8 +465,7 @@ class Loop:
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
                 strong = now.evidence > HALF * self._misfit(fine)
-                gained = self._gained(fine, log_likelihood(fine, self.split.select), whole)
-                if not (strong and Confirmed(now.evidence, now.needed, *gained).much):
+                if not (strong and self.predicts(scene, fine, SURE)):
                     evidence = self._beside(fine, member.name, kept)
                     now = replace(now, evidence=min(evidence, now.evidence))
             found.append(replace(member, confirmed=now, accepted=now.holds(free)))
