@@ -293,7 +293,7 @@ def test_what_is_said_of_accepted_terms(findings):
     last = found.members[2]
     better = dataclasses.replace(last.confirmed, explained=0.38, evidence=220.0, needed=671.0)
     told = dataclasses.replace(
-        found, members=[*found.members[:2], dataclasses.replace(last, confirmed=better)]
+        found, members=[*found.members[:2], dataclasses.replace(last, confirmed=better, gone=False)]
     )
     assert diagnosed((told, *findings[1:])).likely == [Likely("afterpulsing", 40.0, 1.0, 0.38, 220.0, 671.0)]
 
