@@ -37,7 +37,7 @@ from nlos_lit.inference.members import (
     weighed,
 )
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, Pool, ask, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ask, lost, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -48,7 +48,7 @@ Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
-HALF = 0.5  # of the misfit that a fine scene leaves without an effect
+HALF = 0.5  # of the misfit: no scene that lacks something unknown asks for one effect by more
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 IMITATED = frozenset(cls.name for cls in EFFECTS if cls.imitated)
 
@@ -253,28 +253,14 @@ class Loop:
         members = [Member(c) for c in pool.candidates if c.name in IMITATED]
         if not members:
             return base, []
-        effects = [copy.deepcopy(m.candidate.effect) for m in members]
-        for effect in effects:
+        extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
+        for effect in extension.effects:
             effect.reset()
             effect.requires_grad_(True)
-        text = f"building a scene with {', '.join(e.name for e in effects)}"
-        make = partial(self._or_base, base, copy_effects(Extension([]), effects))
-        fit = self.steps("fit", text, "begun", make)
+        self.steps.plan(fit=1)
+        text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
+        fit = self.steps("fit", text, "begun", partial(self._or_base, base, extension))
         return (fit, members) if fit.extension.effects and self.predicts(fit, fine, SURE) else (base, [])
-
-    def lost(self, before: Pool, now: Pool) -> list[Candidate]:
-        """What the counts asked for before terms came, and have lost more than half of their evidence since.
-
-        Args:
-            before: pool beside the scene without the terms.
-            now: beside the scene with them.
-
-        Returns:
-            what may be meant instead, most evidence first; nothing with a number for each spot.
-        """
-        left = {c.name: c.evidence for c in now.candidates}
-        known = [c for c in before.candidates if c.name in left and not c.effect.per_spot]
-        return [c for c in known if c.evidence > max(self.least, 2 * left[c.name])]
 
     def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
         """A scene built with the effects, or the base, where no surfel survives with them."""
@@ -751,7 +737,8 @@ def criticise(
     coarse, new = loop.begun(base, first, pool)
     if new:
         before, pool = pool, asked(effects=True)
-        new = [replace(m, rivals=loop.lost(before, pool)) for m in new]
+        rivals = lost(before.candidates, pool.candidates, loop.least)
+        new = [replace(m, rivals=rivals) for m in new]
         found.members = list(new)
         told(first, coarse, found.members)
     for free in (False, True):

@@ -247,14 +247,29 @@ def together(
             known.append((freed[first.name], (first.scale * deviation).pow(-2).float()))
             before = [c for c in asked if c is not first]
             asked = beside(before)
-            lost = [
-                c for c, now in zip(before, asked, strict=True) if c.evidence > max(least, 2 * now.evidence)
-            ]
+            rivals = lost(before, asked, least)
             ahead = [] if free or taken else [c for c in candidates if _leads(c, first)][:1]
-            taken.append(Taken(first, ahead + sorted(lost, key=lambda c: -c.evidence)))
-            rivals = {c.name for c in lost}
-            asked = [c for c in asked if c.loud > least and c.name not in rivals]
+            taken.append(Taken(first, ahead + rivals))
+            waiting = {c.name for c in rivals}
+            asked = [c for c in asked if c.loud > least and c.name not in waiting]
     return taken
+
+
+def lost(before: list[Candidate], now: list[Candidate], least: float) -> list[Candidate]:
+    """Terms that were asked for, and have lost more than half of their evidence since: they may be meant.
+
+    Args:
+        before: what was found without some terms.
+        now: what is found beside them.
+        least: nats from which on a term is asked for.
+
+    Returns:
+        those of ``before``, most evidence first; none with a number for each spot.
+    """
+    left = {c.name: c.evidence for c in now}
+    known = [c for c in before if c.name in left and not c.effect.per_spot]
+    found = [c for c in known if c.evidence > max(least, 2 * left[c.name])]
+    return sorted(found, key=lambda c: -c.evidence)
 
 
 def _leads(candidate: Candidate, effect: Candidate) -> bool:

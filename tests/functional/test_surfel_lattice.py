@@ -150,7 +150,9 @@ def test_flat_sheets_have_no_flanks_however_they_lean():
 
 @pytest.mark.parametrize(("below", "begun"), [(0.02, 1), (-0.02, 0)])
 def test_a_patch_that_would_turn_too_far_is_too_long_for_a_flank(below, begun):
-    """From 60° on, patches are ``STEEP`` long there: the next one's middle lies one such length on."""
+    """On the smallest cylinder that gets one the next patch is turned by just that much; on one that is two
+    hundredths smaller none begins.
+    """
     cell = 0.03
     own = cell / math.cos(math.radians(60.0))
     at, normal, _ = of_cylinder([60.0])
