@@ -48,7 +48,7 @@ Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
-HALF = 0.5  # of the misfit: no scene that lacks something unknown asks for one effect by more
+HALF = 0.5  # of the misfit: what a scene lacks for unknown reasons looks less like one effect than this
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 IMITATED = frozenset(cls.name for cls in EFFECTS if cls.imitated)
 
@@ -352,8 +352,7 @@ class Loop:
         are left; else the one that is missed least leaves. The scene has bent itself to those that left: it
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
-        unless one that fails would hold without them: what they explain would stand against all others as
-        misfit.
+        however little they are asked for: what they explain would stand against all others as misfit.
 
         Args:
             members: whose terms the scene has.
@@ -375,10 +374,7 @@ class Loop:
             failing = [m for m in staying if not m.stays]
             if not failing:
                 break
-            gone = [m for m in failing if m.name not in enough]
-            if not gone:  # without those that are kept they would have enough
-                gone = [m for m in staying if not m.accepted and m.name not in enough]
-            gone = gone or [min(failing, key=_gain)]
+            gone = [m for m in failing if m.name not in enough] or [min(failing, key=_gain)]
             left |= {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
             if coarse is None or before is None:
@@ -417,9 +413,8 @@ class Loop:
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
         effects must be asked for as much as they need beside such a scene when it has become fine. Not those
-        with more evidence than half of the misfit that this leaves, if other spots are surely predicted
-        better with them: beside a scene that imitates a strong one the counts ask for it no more, no misfit
-        of unknown kind looks so much like one effect, and cells that are too wide predict no better.
+        that account for half of the misfit which this leaves: beside a scene that imitates a strong one, or
+        fails without it, the counts ask for it no more.
 
         Args:
             members: those that hold are asked.
@@ -450,12 +445,24 @@ class Loop:
             if now.holds(free) and not free and not per_spot:
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
-                strong = now.evidence > HALF * self._misfit(fine)
-                if not (strong and self.predicts(scene, fine, SURE)):
+                if not self._accounts(now.evidence, scene, fine):
                     evidence = self._beside(fine, member.name, kept)
                     now = replace(now, evidence=min(evidence, now.evidence))
             found.append(replace(member, confirmed=now, accepted=now.holds(free)))
         return found
+
+    def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
+        """An effect of a scene accounts for half of the misfit of a fine one without it.
+
+        Other spots are surely predicted better with it, which cells that are too wide do not bring about: by
+        half of that misfit, or it has as much own evidence. No misfit of unknown kind looks so much like one
+        effect.
+        """
+        if not self.predicts(scene, fine, SURE):
+            return False
+        select = self.split.select
+        gain = float((log_likelihood(scene, select) - log_likelihood(fine, select)).sum())
+        return evidence > HALF * self._misfit(fine) or gain > HALF * misfit_of(fine, select, len(select))
 
     def _beside(self, fine: SurfelFit, name: str, kept: str) -> float:
         """Nats that a term has beside a fine scene without it: cells too wide for a scene ask for terms that

@@ -307,7 +307,8 @@ def own_evidence(
             the nats that it would have more if the others were not there.
 
     Returns:
-        nats that each has, and those that it needs, by name; and who is left.
+        nats that each has, and those that it needs, by name; and who is left. Where such a one has too little
+        beside all others, it is told what it has when those who leave are gone.
     """
     problem, block = _problem(fit, split, most, seed, with_effects=False)
     whole = Projector(problem)
@@ -343,19 +344,26 @@ def own_evidence(
         # What the others do scatters like a misfit where a look-alike has to stand for it.
         return nats, bar(lit, max(0.0, one(name, others)[2] - nats) if others else 0.0)
 
+    found = dict[str, tuple[float, float]]()
+
     def left(asked: list[str], gone: tuple[str, ...]) -> list[str]:
         now = {n: judged(n, gone) for n in asked}
         while short := [n for n, (nats, needed) in now.items() if nats <= needed]:
             worst = min(short, key=lambda n: now[n][0] / now[n][1])
-            del now[worst]
+            found[worst] = now.pop(worst)
             gone = (*gone, worst)
             now |= {n: judged(n, gone) for n in short if n in now}
+        found.update(now)
         return list(now)
 
     free = [n for n in names if n in FREE_NAMES]
     enough = left([n for n in names if n not in free], tuple(free))
     enough += left(free, tuple(n for n in names if n not in free and n not in enough))
-    return {name: judged(name, ()) for name in names}, enough
+    beside = {name: judged(name, ()) for name in names}
+    return {
+        n: found[n] if n in enough and nats <= needed else (nats, needed)
+        for n, (nats, needed) in beside.items()
+    }, enough
 
 
 def _above_null(effect: Effect) -> Tensor:

@@ -488,22 +488,16 @@ def test_what_predicts_surely_better_stays_in_the_scene_unnamed(monkeypatch, gai
         assert world.hold(*table)[1].names == {"irf_tail"}
 
 
-def test_what_is_kept_leaves_where_another_holds_without_it(monkeypatch):
-    """Beside each other none has enough; without it the other has."""
-    table = {"wall_reflectance": nats(99.0), "irf_tail": nats(1.0)}
-    world = World(monkeypatch, table, [candidate(n) for n in table], misfit=100.0)
-    own = world.own_evidence
-
-    def asked(fit, split, most, seed, names, bar):
-        alone = names == ["irf_tail"]
-        world.own = {"wall_reflectance": 1.0, "irf_tail": 50.0 if alone else 1.0}
-        return own(fit, split, most, seed, names, bar)[0], ["irf_tail"]
-
-    monkeypatch.setattr(loop, "own_evidence", asked)
-    found, scene = world.hold(*table)
-    assert {n: m.stays for n, m in found.items()} == {"wall_reflectance": False, "irf_tail": True}
-    assert found["irf_tail"].accepted
-    assert scene.names == {"irf_tail"}
+def test_what_is_kept_unnamed_does_not_stand_against_another(monkeypatch):
+    """Without it the other has enough, and holds; both stay."""
+    table = {"wall_reflectance": nats(99.0), "irf_tail": nats(9.0)}
+    own = {"wall_reflectance": 1.0, "irf_tail": 50.0}  # when the first is gone
+    found, scene = World(monkeypatch, table, [candidate(n) for n in table], own, misfit=100.0).hold(*table)
+    assert {n: (m.accepted, m.stays) for n, m in found.items()} == {
+        "wall_reflectance": (False, True),
+        "irf_tail": (True, True),
+    }
+    assert scene.names == {*table}
 
 
 def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):
@@ -552,6 +546,19 @@ def test_a_strong_effect_need_not_be_asked_for_beside_a_scene_that_imitates_it(
     (found,), _, _ = world.loop().hold(
         [Member(world.pool[0])], *scenes, Held([], fitted(fine=True), fitted())
     )
+    assert found.accepted is accepted
+
+
+@pytest.mark.parametrize(("gain", "accepted"), [(40.1, True), (39.9, False)])
+def test_an_effect_that_predicts_half_of_the_misfit_need_not_be_asked_for_beside_a_scene_that_fails(
+    monkeypatch, gain, accepted
+):
+    """120 spots leave 80 nats of the 200 that 300 do. Its own 60 are less than half of these."""
+    table = {"irf_tail": nats(70.0), "fine": nats(70.0 - gain), "fine+irf_tail": nats(70.0)}
+    pool, own = [candidate("irf_tail")], {"irf_tail": 60.0}
+    world = World(monkeypatch, table, pool, own, misfit=200.0, when_fine={"irf_tail": 0.0})
+    scenes = fitted("irf_tail", fine=True), fitted("irf_tail")
+    (found,), _, _ = world.loop().hold([Member(pool[0])], *scenes, Held([], fitted(fine=True), fitted()))
     assert found.accepted is accepted
 
 
