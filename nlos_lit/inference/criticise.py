@@ -454,11 +454,11 @@ class Loop:
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
         """An effect of a scene accounts for half of the misfit of a fine one without it.
 
-        Other spots are surely predicted better with it, which cells that are too wide do not bring about: by
-        half of that misfit, or it has as much own evidence. No misfit of unknown kind looks so much like one
-        effect.
+        Other spots are predicted better with it, which cells that are too wide do not bring about, but for
+        the chance of a false name: by half of that misfit, or it has as much own evidence. No misfit of
+        unknown kind looks so much like one effect.
         """
-        if not self.predicts(scene, fine, SURE):
+        if not self.predicts(scene, fine, 1 - self.settings.level):
             return False
         select = self.split.select
         gain = float((log_likelihood(scene, select) - log_likelihood(fine, select)).sum())
