@@ -14,6 +14,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
 from nlos_lit.effects.strengths import bound_notes
@@ -90,6 +91,8 @@ def assemble(
     most = left[0] if worst is None else (worst.axis, worst.evidence)
     fitted, test = torch.from_numpy(np.concatenate([split.fit, split.select])), split.test
     largest = first[0].evidence
+    over = max([largest - found.needed, *(a.evidence - a.needed for a in accepted if a.needed is not None)])
+    along = [m.candidate.effect for m in found.present if not m.accepted] if found.accepted else []
     return Diagnosis(
         effects=named,
         unknown=unknown,
@@ -102,27 +105,26 @@ def assemble(
         witness=witness(capture, final),
         profiles=profiles(base, final, scan, fitted),
         needed=found.needed,
-        chance=math.exp(min(0.0, math.log(settings.level) + found.needed - largest))
-        if null is None
-        else null.chance(largest),
-        notes=[*bound_notes(final.extension.effects), *_kept(found)],
+        chance=math.exp(min(0.0, math.log(settings.level) - over)) if null is None else null.chance(largest),
+        notes=[*bound_notes(final.extension.effects), *_unnamed(along)],
         capture=facts_of(capture, name),
         toys=0 if null is None else null.toys,
         seconds=seconds,
         seed=seed,
         likely=_likely(found.members),
+        along=[e.name for e in along],
     )
 
 
-def _kept(found: Findings) -> list[str]:
+def _unnamed(effects: list[Effect]) -> list[str]:
     """What is in the last model and not named."""
-    kept = [m.candidate.effect for m in found.present if not m.accepted] if found.accepted else []
-    if not kept:
+    if not effects:
         return []
-    phrases = "; ".join(e.name if e.words is None else e.words.phrase for e in kept)
+    phrases = "; ".join(e.name if e.words is None else e.words.phrase for e in effects)
+    they = "it" if len(effects) == 1 else "each of them"
     return [
-        "Fitted along and not named, since other spots are predicted better with it and the counts ask for it"
-        f" less than they need to: {phrases}."
+        f"Fitted along and not named, since other spots are predicted better with {they} and the counts ask"
+        f" for {they} less than they would have to: {phrases}."
     ]
 
 

@@ -238,9 +238,10 @@ class Diagnosis:
         groups: names that the capture cannot tell apart, an accepted effect first.
         needed: nats of evidence that a term of this pool needed.
         chance: of evidence as large as the largest, without any effect: counted over ``toys``; without toys
-            what the theory says.
+            what the theory says of the one that exceeds most what it needs.
         further: what other captures said of the groups.
         likely: terms that were tried, predict much and are not certain, the largest gain first.
+        along: effects that the last model has without a name.
     """
 
     effects: list[Accepted]
@@ -262,6 +263,7 @@ class Diagnosis:
     seed: int
     further: list[Further] = field(default_factory=list)
     likely: list[Likely] = field(default_factory=list)
+    along: list[str] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-serialisable."""

@@ -96,7 +96,8 @@ def next_step(diagnosis: Diagnosis, scene: Sequence[str] = (), folder: Path | No
     found = sorted(diagnosis.effects, key=_gain, reverse=True)
     if found:
         first = found[0]
-        known = shlex.join([*base, f"effects=[{','.join(e.name for e in diagnosis.effects)}]"])
+        names = [*(e.name for e in diagnosis.effects), *diagnosis.along]
+        known = shlex.join([*base, f"effects=[{','.join(names)}]"])
         others = rivals(diagnosis, first)
         if others and first.split_by:
             asked = "" if folder is None else f"nlos diagnose {shlex.quote(str(folder))} --split-with FILE\n"

@@ -425,6 +425,11 @@ def _screened(diagnosis: Diagnosis) -> str:
         " trace once scene, albedo and response have adapted. Scatter: how much more its trace varies over"
         f" the wall than counts do, where that is more than {SCATTERED}."
     )
+    if any(s.name in accepted and s.evidence <= diagnosis.needed for s in diagnosis.screened):
+        text += (
+            " Accepted with less here: asked for when the model had other terms already. A scene without"
+            " a strong effect imitates it, and asks for it no more."
+        )
     return f"<p>{_text(text)}</p>" + _table(heads, rows)
 
 

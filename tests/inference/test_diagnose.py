@@ -84,7 +84,7 @@ def test_a_diagnosis_leaves_page_numbers_and_figures(finished):
     assert set(said) == {
         "effects", "unknown", "groups", "unexplained", "screened", "base", "extended", "untouched_test",
         "witness", "profiles", "needed", "chance", "notes", "capture", "toys", "seconds", "seed", "further",
-        "likely",
+        "likely", "along",
     }  # fmt: skip
     assert {s["name"] for s in said["screened"]} == {e.name for e in [*EFFECTS, *FREE]}
     for one in said["screened"]:

@@ -386,13 +386,21 @@ def test_what_the_last_model_has_without_a_name_is_in_the_notes(findings):
     for weight, told in ((0.96, True), (0.94, False)):
         kept = Member(found_candidate("ghost_pulse", scan, 9.0), (), dataclasses.replace(sure, weight=weight))
         more = dataclasses.replace(found, members=[*found.members, kept])
-        notes = diagnosed((more, measured, split, scan)).notes
-        assert any("and not named" in n and "delayed pulse" in n for n in notes) is told
+        said = diagnosed((more, measured, split, scan))
+        assert any("and not named" in n and "delayed pulse" in n for n in said.notes) is told
+        assert said.along == ["ghost_pulse"] * told
 
 
 @FORWARD_MODE
 def test_the_chance_is_that_of_toys_or_of_theory(findings):
+    found, *others = findings
     assert diagnosed(findings).chance == pytest.approx(0.01 * math.exp(8 - 500))
+    weak = [dataclasses.replace(c, evidence=4.0) for c in found.pools[0].candidates]
+    pools = [dataclasses.replace(found.pools[0], candidates=weak), *found.pools[1:]]
+    said = diagnosed((dataclasses.replace(found, pools=pools), *others))
+    over = max(e.evidence - e.needed for e in [*said.effects, *said.unknown])
+    assert over > 0
+    assert said.chance == pytest.approx(0.01 * math.exp(-over)), "asked for beside other terms"
     said = diagnosed(findings, Null([600.0, 3.0, 1.0]))
     assert (said.chance, said.toys) == (0.5, 3)
 

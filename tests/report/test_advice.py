@@ -53,6 +53,8 @@ def test_what_to_do_next_depends_on_what_was_found():
     alone = next_step(two_found(effects=[TAIL_ALONE], groups=[]), scene)
     assert alone.text.startswith("Measure the instrument response on the direct pulse")
     assert alone.command == "nlos train scene=capture 'scene.path=my file.mat' 'effects=[irf_tail]'"
+    along = next_step(two_found(effects=[TAIL_ALONE], groups=[], along=["pile_up"]), scene)
+    assert along.command.endswith("'effects=[irf_tail,pile_up]'"), "the model that was measured"
     both = next_step(two_found(effects=[TAIL_ALONE, TILT], groups=[]), scene)
     assert "effects=[irf_tail,wall_tilt]" in both.command
     assert both.text.startswith("Measure the wall's plane")  # of the larger gain

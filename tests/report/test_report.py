@@ -410,6 +410,14 @@ def test_markup_in_names_is_escaped(written):
         assert said in page, said
 
 
+def test_what_was_accepted_with_little_evidence_at_first_is_explained():
+    """The table holds what was asked for beside the scene without effects."""
+    (has,) = (s.evidence for s in two_found().screened if s.name == "irf_tail")
+    for more, told in ((0.1, True), (-0.1, False)):
+        page = report_html(two_found(effects=[TAIL_ALONE], groups=[], needed=has + more), {})
+        assert ("Accepted with less here" in Page(page).words) is told
+
+
 def test_what_could_not_have_been_seen_is_said():
     text = Page(report_html(CASES["nothing"], {})).words
     limits = text[text.index("What could not have been seen") :]
