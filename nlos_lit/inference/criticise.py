@@ -352,7 +352,8 @@ class Loop:
         are left; else the one that is missed least leaves. The scene has bent itself to those that left: it
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
-        however little they are asked for: what they explain would stand against all others as misfit.
+        however little they are asked for: what they explain would stand against all others as misfit. But
+        those that lack only what others take leave one after the other: they share what one of them may do.
 
         Args:
             members: whose terms the scene has.
@@ -369,12 +370,12 @@ class Loop:
         while staying:
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            if coarse is not None and all(m.stays for m in staying):
+            gone = _leaving(staying, enough)
+            if not gone and coarse is not None:
                 staying = self._anew(staying, coarse, scene)
-            failing = [m for m in staying if not m.stays]
-            if not failing:
+                gone = _leaving(staying, enough)
+            if not gone:
                 break
-            gone = [m for m in failing if m.name not in enough] or [min(failing, key=_gain)]
             left |= {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
             if coarse is None or before is None:
@@ -505,8 +506,8 @@ class Loop:
         for member, fit in zip(members, fewer, strict=True):
             before = log_likelihood(fit, select)
             gain, weight, explained = self._gained(fit, before, value)
-            evidence, needed = own[member.name]
-            confirmed = Confirmed(evidence, needed, gain, weight, explained)
+            evidence, needed, shared = own[member.name]
+            confirmed = Confirmed(evidence, needed, gain, weight, explained, shared)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
             holds = confirmed.holds(member.candidate.free)
@@ -516,7 +517,7 @@ class Loop:
 
     def _own(
         self, scene: SurfelFit, names: list[str], kept: str
-    ) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    ) -> tuple[dict[str, tuple[float, float, float]], list[str]]:
         """Own evidence of some terms of a scene with what they need there, and who is left when all who have
         less are gone.
         """
@@ -603,8 +604,8 @@ class Loop:
         for member in came:
             none = next(t for t in member.trials if t.candidate is None)
             gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
-            evidence, needed = own[member.name]
-            confirmed[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained))
+            evidence, needed, shared = own[member.name]
+            confirmed[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained, shared))
         return [confirmed.get(m.name, m) for m in settled], scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
@@ -748,6 +749,7 @@ def criticise(
         new = [replace(m, rivals=rivals) for m in new]
         found.members = list(new)
         told(first, coarse, found.members)
+    doubted: Held | None = None
     for free in (False, True):
         while come := loop.next(pool, free):
             coarse = loop.joined(coarse, [m.candidate for m in come])
@@ -759,11 +761,21 @@ def criticise(
             tried, scene, left = loop.hold(new, grown, coarse, held)
             now = {m.name: m for m in tried}
             found.members = [now.get(m.name, m) for m in found.members]
-            held = Held(found.present, scene, left or coarse)
+            kept = [m for m in found.present if doubted is None or m.name in now]
+            held = Held(kept, scene, left or coarse)
+            if kept and not free and not loop.predicts(scene, first):
+                doubted, held = held, Held([], first, base)  # what something unknown does may stand for them
         if held.coarse is not coarse and not free:
             coarse = held.coarse
             pool = asked(effects=False)
         new = []
+    if doubted is not None and not held.members:
+        held = doubted
+    elif doubted is not None:
+        less = {m.name for m in doubted.members}
+        found.members = [
+            replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members
+        ]
     found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
         found.final = scene
@@ -772,6 +784,20 @@ def criticise(
         found.members = [replace(m, accepted=False) for m in found.members]
     told(first, found.final, found.members)
     return found
+
+
+def _leaving(members: list[Member], enough: list[str]) -> list[Member]:
+    """Who of some members that were asked leaves; ``enough`` would have enough without the others."""
+    failing = [m for m in members if not m.stays]
+    if failing:
+        return [m for m in failing if m.name not in enough] or [min(failing, key=_gain)]
+    return sorted((m for m in members if not m.accepted and m.stands_in), key=_share)[:1]
+
+
+def _share(member: Member) -> float:
+    """Of the evidence that it needs."""
+    assert member.confirmed is not None
+    return member.confirmed.evidence / member.confirmed.needed
 
 
 def _gain(member: Member) -> float:

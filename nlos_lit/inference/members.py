@@ -53,6 +53,7 @@ class Confirmed:
             less.
         weight: how far the capture leaves open that it predicts better than that one.
         explained: share of what the select spots leave unexplained without it.
+        shared: of what is needed, nats for what other terms take from it.
     """
 
     evidence: float
@@ -60,6 +61,7 @@ class Confirmed:
     gain: Comparison
     weight: float
     explained: float = 0.0
+    shared: float = 0.0
 
     @property
     def much(self) -> bool:
@@ -108,6 +110,12 @@ class Member:
         """It does not hold, although spots that were not fitted are predicted much better with it."""
         known = not self.accepted and not self.gone
         return known and self.confirmed is not None and self.confirmed.much
+
+    @property
+    def stands_in(self) -> bool:
+        """Its evidence is less than it needs by no more than what it needs because of other terms."""
+        c = self.confirmed
+        return c is not None and c.needed - c.shared < c.evidence <= c.needed
 
     @property
     def stays(self) -> bool:

@@ -290,7 +290,7 @@ def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:
 
 def own_evidence(
     fit: SurfelFit, split: Split, most: int, seed: int, names: list[str], bar: Callable[[float, float], float]
-) -> tuple[dict[str, tuple[float, float]], list[str]]:
+) -> tuple[dict[str, tuple[float, float, float]], list[str]]:
     """How much the counts ask for each of several terms that a fit has, beside all else that it may do.
 
     Then who has less than it needs is taken out of the linear problem, one after the other, the one that
@@ -307,8 +307,9 @@ def own_evidence(
             the nats that it would have more if the others were not there.
 
     Returns:
-        nats that each has, and those that it needs, by name; and who is left. Where such a one has too little
-        beside all others, it is told what it has when those who leave are gone.
+        nats that each has, those that it needs, and of these those for what the others take, by name; and who
+        is left. Where such a one has too little beside all others, it is told what it has when those who
+        leave are gone.
     """
     problem, block = _problem(fit, split, most, seed, with_effects=False)
     whole = Projector(problem)
@@ -339,16 +340,17 @@ def own_evidence(
         return found.nats - many, found.lit, found.loud - many
 
     @cache
-    def judged(name: str, gone: tuple[str, ...]) -> tuple[float, float]:
+    def judged(name: str, gone: tuple[str, ...]) -> tuple[float, float, float]:
         (nats, lit, _), others = one(name, gone), tuple(n for n in laws if n != name and n in names)
         # What the others do scatters like a misfit where a look-alike has to stand for it.
-        return nats, bar(lit, max(0.0, one(name, others)[2] - nats) if others else 0.0)
+        needed = bar(lit, max(0.0, one(name, others)[2] - nats) if others else 0.0)
+        return nats, needed, needed - bar(lit, 0.0)
 
-    found = dict[str, tuple[float, float]]()
+    found = dict[str, tuple[float, float, float]]()
 
     def left(asked: list[str], gone: tuple[str, ...]) -> list[str]:
         now = {n: judged(n, gone) for n in asked}
-        while short := [n for n, (nats, needed) in now.items() if nats <= needed]:
+        while short := [n for n, (nats, needed, _) in now.items() if nats <= needed]:
             worst = min(short, key=lambda n: now[n][0] / now[n][1])
             found[worst] = now.pop(worst)
             gone = (*gone, worst)
@@ -359,11 +361,11 @@ def own_evidence(
     free = [n for n in names if n in FREE_NAMES]
     enough = left([n for n in names if n not in free], tuple(free))
     enough += left(free, tuple(n for n in names if n not in free and n not in enough))
-    beside = {name: judged(name, ()) for name in names}
-    return {
-        n: found[n] if n in enough and nats <= needed else (nats, needed)
-        for n, (nats, needed) in beside.items()
-    }, enough
+    for name in names:
+        beside = judged(name, ())
+        if name not in enough or beside[0] > beside[1]:
+            found[name] = beside
+    return found, enough
 
 
 def _above_null(effect: Effect) -> Tensor:

@@ -344,6 +344,7 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
         assert asked[effect.name] == (
             pytest.approx(nats.nats - many, rel=1e-3),
             pytest.approx(nats.lit, rel=1e-3),
+            0,
         )
     assert asked["irf_tail"][0] > 20
 
@@ -362,8 +363,7 @@ def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
 
     more = 1e6  # than any has, so that none leaves
     both = {
-        n: (nats, needed + more)
-        for n, (nats, needed) in own(fit, names, lambda _, lost: lost - more)[0].items()
+        n: (nats, taken) for n, (nats, _, taken) in own(fit, names, lambda _, lost: lost - more)[0].items()
     }
     alone = own(single, ["irf_tail"], lambda _, lost: 1 + lost)[0]
     # Its scatter beside nothing counts as its own.
@@ -372,9 +372,11 @@ def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
     bar = (both["irf_tail"][0] + alone["irf_tail"][0]) / 2
     asked, left = own(fit, names, lambda *_: bar)
     assert left == ["irf_tail"]
-    assert asked["free_time"] == (both["free_time"][0], bar)
+    assert asked["free_time"] == (both["free_time"][0], bar, 0)
     assert both["irf_tail"][0] < bar < alone["irf_tail"][0]
-    assert asked["irf_tail"] == (pytest.approx(alone["irf_tail"][0], rel=0.02), bar), "as without the other"
+    assert asked["irf_tail"] == (pytest.approx(alone["irf_tail"][0], rel=0.02), bar, 0), (
+        "as without the other"
+    )
     none, left = own(fit, names, lambda *_: 2 * alone["irf_tail"][0])
     assert (left, none["irf_tail"][0]) == ([], both["irf_tail"][0]), "it leaves, too"
 

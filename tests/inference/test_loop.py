@@ -144,14 +144,15 @@ class World:
 
     def own_evidence(
         self, fit: FakeFit, split, most, seed, names: list[str], bar
-    ) -> tuple[dict[str, tuple[float, float]], list[str]]:
+    ) -> tuple[dict[str, tuple[float, float, float]], list[str]]:
         assert set(names) <= fit.names
         self.asked.append(names)
         found = {c.name: c for c in self.pool}
         own = {n: (self.own.get(n, 300.0), found[n].lit if n in found else 1.0) for n in names}
         own |= {n: (found[n].evidence, found[n].lit) for n in names if n in found and n not in self.own}
-        own = {n: (nats, bar(lit, self.lost.get(n, 0.0))) for n, (nats, lit) in own.items()}
-        return own, [n for n, (nats, needed) in own.items() if nats > needed]
+        bars = {n: (bar(lit, self.lost.get(n, 0.0)), bar(lit, 0.0)) for n, (_, lit) in own.items()}
+        asked = {n: (own[n][0], most, most - least) for n, (most, least) in bars.items()}
+        return asked, [n for n, (nats, needed, _) in asked.items() if nats > needed]
 
     def rebuild(self, extension: Extension, seed: int) -> FakeFit:
         fit = FakeFit(extension, seed, anew=True)
@@ -500,6 +501,25 @@ def test_what_is_kept_unnamed_does_not_stand_against_another(monkeypatch):
     assert scene.names == {*table}
 
 
+@pytest.mark.parametrize(("over", "named"), [(0.1, {"irf_tail"}), (-0.1, set())])
+def test_of_those_that_lack_only_what_others_take_the_weakest_leaves(monkeypatch, over, named):
+    """By itself each needs ``LEAST``, beside the other 100 nats more. Other spots want both."""
+    table = {"irf_tail": nats(99.0), "afterpulsing": nats(9.0)}
+    own, lost = {"irf_tail": LEAST + over, "afterpulsing": LEAST + over / 2}, dict.fromkeys(table, 400.0)
+    world = World(monkeypatch, table, [candidate(n) for n in table], own, lost=lost)
+    told = world.own_evidence
+
+    def asked(fit, split, most, seed, names, bar):
+        world.lost = lost if len(names) == 2 else {}
+        return told(fit, split, most, seed, names, bar)
+
+    monkeypatch.setattr(loop, "own_evidence", asked)
+    found, scene = world.hold(*table)
+    assert {n for n, m in found.items() if m.accepted} == named
+    assert {n for n, m in found.items() if m.gone} == ({"afterpulsing"} if named else set())
+    assert scene.names == (named or {*table})
+
+
 def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):
     """Neither is missed beside the other; without the one that gains less the other is."""
     for pair, stays in ((("irf_tail", "afterpulsing"), "irf_tail"), (("free_time", "irf_tail"), "free_time")):
@@ -625,6 +645,21 @@ def test_a_rival_may_predict_better_than_a_finer_scene(monkeypatch, rival, named
     assert found.final.names == named
     assert {m.name for m in found.accepted} == named
     assert (found.again is not None) is bool(named)
+
+
+@pytest.mark.parametrize(("free", "named"), [(70.0, {"free_time"}), (-1.0, set())])
+def test_free_terms_are_asked_without_an_effect_that_predicts_worse_than_a_finer_scene(
+    monkeypatch, free, named
+):
+    """It stands for something unknown, which explains nothing beside it, and leaves where that holds."""
+    table = {"fine": nats(60.0), "irf_tail": nats(50.0), "free_time": nats(free)}
+    table |= {"fine+irf_tail": nats(40.0), "fine+anew+irf_tail": nats(40.0)}
+    both = ["free_time", "irf_tail"]
+    table |= {"+".join([*built, *both]): nats(30.0) for built in ([], ["anew"], ["fine"], ["fine", "anew"])}
+    pool = [candidate("irf_tail"), candidate("free_time", 50.0)]
+    found = World(monkeypatch, table, pool).criticise()
+    assert {m.name for m in found.accepted} == found.final.names == named
+    assert [m.gone for m in found.members if m.name == "irf_tail"] == [bool(named)]
 
 
 @pytest.mark.parametrize(("evidence", "named"), [(LEAST + 0.1, True), (LEAST - 0.1, False)])
