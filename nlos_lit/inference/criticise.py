@@ -48,7 +48,7 @@ Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
-HALF = 0.5  # of the misfit: what a scene lacks for unknown reasons looks less like one effect than this
+HALF = 0.5  # of the misfit: one effect predicts less of what a scene lacks for unknown reasons
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
 IMITATED = frozenset(cls.name for cls in EFFECTS if cls.imitated)
 
@@ -414,7 +414,7 @@ class Loop:
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
         effects must be asked for as much as they need beside such a scene when it has become fine. Not those
-        that account for half of the misfit which this leaves: beside a scene that imitates a strong one, or
+        that account for most of the misfit which this leaves: beside a scene that imitates a strong one, or
         fails without it, the counts ask for it no more.
 
         Args:
@@ -453,17 +453,17 @@ class Loop:
         return found
 
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
-        """An effect of a scene accounts for half of the misfit of a fine one without it.
+        """An effect of a scene accounts for most of the misfit of a fine one without it.
 
         Other spots are predicted better with it, which cells that are too wide do not bring about, but for
-        the chance of a false name: by half of that misfit, or it has as much own evidence. No misfit of
-        unknown kind looks so much like one effect.
+        the chance of a false name: by half of that misfit, or it has more own evidence than all of it. What is
+        missing for unknown reasons looks less like one effect than that.
         """
         if not self.predicts(scene, fine, 1 - self.settings.level):
             return False
         select = self.split.select
         gain = float((log_likelihood(scene, select) - log_likelihood(fine, select)).sum())
-        return evidence > HALF * self._misfit(fine) or gain > HALF * misfit_of(fine, select, len(select))
+        return evidence > self._misfit(fine) or gain > HALF * misfit_of(fine, select, len(select))
 
     def _beside(self, fine: SurfelFit, name: str, kept: str) -> float:
         """Nats that a term has beside a fine scene without it: cells too wide for a scene ask for terms that

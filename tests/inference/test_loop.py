@@ -550,12 +550,12 @@ def test_a_scene_that_never_had_a_term_may_do_without_it(monkeypatch, other, acc
 
 
 @pytest.mark.parametrize(
-    ("misfit", "fine", "accepted"), [(199, 65.4, True), (201, 65.4, False), (199, 65.5, False)]
+    ("misfit", "fine", "accepted"), [(99.9, 65.4, True), (100.1, 65.4, False), (99.9, 65.5, False)]
 )
 def test_a_strong_effect_need_not_be_asked_for_beside_a_scene_that_imitates_it(
     monkeypatch, misfit, fine, accepted
 ):
-    """With 100 nats of its own it has half of the misfit. The scene with it predicts other spots better with
+    """With 100 nats of its own it has all of the misfit. The scene with it predicts other spots better with
     a chance of 99 %, by ln 99, or not.
     """
     table = {"irf_tail": nats(70.0), "fine": nats(fine), "fine+irf_tail": nats(70.0)}
@@ -573,7 +573,7 @@ def test_a_strong_effect_need_not_be_asked_for_beside_a_scene_that_imitates_it(
 def test_an_effect_that_predicts_half_of_the_misfit_need_not_be_asked_for_beside_a_scene_that_fails(
     monkeypatch, gain, accepted
 ):
-    """120 spots leave 80 nats of the 200 that 300 do. Its own 60 are less than half of these."""
+    """120 spots leave 80 nats of the 200 that 300 do. Its own 60 are less than these."""
     table = {"irf_tail": nats(70.0), "fine": nats(70.0 - gain), "fine+irf_tail": nats(70.0)}
     pool, own = [candidate("irf_tail")], {"irf_tail": 60.0}
     world = World(monkeypatch, table, pool, own, misfit=200.0, when_fine={"irf_tail": 0.0})
