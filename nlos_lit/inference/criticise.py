@@ -456,8 +456,8 @@ class Loop:
         """An effect of a scene accounts for most of the misfit of a fine one without it.
 
         Other spots are predicted better with it, which cells that are too wide do not bring about, but for
-        the chance of a false name: by half of that misfit, or it has more own evidence than all of it. What is
-        missing for unknown reasons looks less like one effect than that.
+        the chance of a false name: by half of that misfit, or its own evidence is more than all of it. What
+        is missing for unknown reasons looks less like one effect than that.
         """
         if not self.predicts(scene, fine, 1 - self.settings.level):
             return False
