@@ -413,9 +413,10 @@ class Loop:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
-        effects must be asked for as much as they need beside such a scene when it has become fine. Not those
-        that account for most of the misfit which this leaves: beside a scene that imitates a strong one, or
-        fails without it, the counts ask for it no more.
+        terms must be asked for as much as they need beside such a scene when it has become fine, but for free
+        ones that hold by what they predict, and numbers of single spots. Not effects that account for most of
+        the misfit which this leaves: beside a scene that imitates a strong one, or fails without it, the
+        counts ask for it no more.
 
         Args:
             members: those that hold are asked.
@@ -443,7 +444,7 @@ class Loop:
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
             free, per_spot = member.candidate.free, member.candidate.effect.per_spot
-            if now.holds(free) and not free and not per_spot:
+            if now.holds(free) and not per_spot and not (free and now.much):
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
                 if not self._accounts(now.evidence, scene, fine):

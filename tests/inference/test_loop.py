@@ -569,6 +569,17 @@ def test_a_strong_effect_need_not_be_asked_for_beside_a_scene_that_imitates_it(
     assert found.accepted is accepted
 
 
+@pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
+def test_a_free_term_that_predicts_much_need_not_be_asked_for_beside_a_fine_scene(
+    monkeypatch, gain, accepted
+):
+    """A quarter of the 40 nats that 120 spots leave of 100."""
+    pool, scenes = [candidate("free_time")], (fitted("free_time", fine=True), fitted("free_time"))
+    world = World(monkeypatch, {"free_time": nats(gain)}, pool, misfit=100.0, when_fine={"free_time": 0.0})
+    (found,), _, _ = world.loop().hold([Member(pool[0])], *scenes, Held([], fitted(fine=True), fitted()))
+    assert found.accepted is accepted
+
+
 @pytest.mark.parametrize(("gain", "accepted"), [(40.1, True), (39.9, False)])
 def test_an_effect_that_predicts_half_of_the_misfit_need_not_be_asked_for_beside_a_scene_that_fails(
     monkeypatch, gain, accepted
@@ -585,12 +596,9 @@ def test_an_effect_that_predicts_half_of_the_misfit_need_not_be_asked_for_beside
 @pytest.mark.parametrize("name", ["retroreflection", "free_time", "timing_jitter"])
 @pytest.mark.parametrize(("over", "accepted"), [(-0.1, False), (0.1, True)])
 @pytest.mark.parametrize("misfit", [0.0, 100.0, 300.0, 800.0])
-def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(
-    monkeypatch, name, over, accepted, misfit
-):
+def test_a_term_must_be_asked_for_beside_a_fine_scene_without_it(monkeypatch, name, over, accepted, misfit):
     """As much as beside the scene with it. Wide cells may ask for what a finer scene does by itself, which
-    predicts as well then. Free terms claim no cause; single spots have over their neighbours what no scene
-    can give them.
+    predicts as well then. Single spots have over their neighbours what no scene can give them.
     """
     needed = LEAST + SETTINGS.share * misfit
     table = {name: nats(70.0), "fine": nats(69.0), f"fine+{name}": nats(70.0)}
@@ -600,7 +608,7 @@ def test_an_effect_must_be_asked_for_beside_a_fine_scene_without_it(
     (found,), scene, _ = world.loop().hold(
         [Member(world.pool[0])], *scenes, Held([], fitted(fine=True), fitted())
     )
-    accepted = accepted or name != "retroreflection"
+    accepted = accepted or name == "timing_jitter"
     assert (found.accepted, scene.names) == (accepted, {name} if accepted else set())
     if not accepted:
         told = found.confirmed.evidence, found.confirmed.needed
