@@ -353,7 +353,8 @@ class Loop:
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
         however little they are asked for: what they explain would stand against all others as misfit. But
-        those that lack only what others take leave one after the other: they share what one of them may do.
+        where one lacks only what others take, those that are missed least leave, one after the other: they
+        share what one of them may do.
 
         Args:
             members: whose terms the scene has.
@@ -792,13 +793,8 @@ def _leaving(members: list[Member], enough: list[str]) -> list[Member]:
     failing = [m for m in members if not m.stays]
     if failing:
         return [m for m in failing if m.name not in enough] or [min(failing, key=_gain)]
-    return sorted((m for m in members if not m.accepted and m.stands_in), key=_share)[:1]
-
-
-def _share(member: Member) -> float:
-    """Of the evidence that it needs."""
-    assert member.confirmed is not None
-    return member.confirmed.evidence / member.confirmed.needed
+    unnamed = [m for m in members if not m.accepted]
+    return sorted(unnamed, key=_gain)[:1] if any(m.stands_in for m in unnamed) else []
 
 
 def _gain(member: Member) -> float:

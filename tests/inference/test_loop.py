@@ -502,10 +502,13 @@ def test_what_is_kept_unnamed_does_not_stand_against_another(monkeypatch):
 
 
 @pytest.mark.parametrize(("over", "named"), [(0.1, {"irf_tail"}), (-0.1, set())])
-def test_of_those_that_lack_only_what_others_take_the_weakest_leaves(monkeypatch, over, named):
-    """By itself each needs ``LEAST``, beside the other 100 nats more. Other spots want both."""
+def test_where_one_lacks_only_what_others_take_the_one_that_is_missed_least_leaves(monkeypatch, over, named):
+    """By itself each needs ``LEAST``, beside the other 100 nats more. Other spots want both.
+
+    The one that leaves has no evidence at all.
+    """
     table = {"irf_tail": nats(99.0), "afterpulsing": nats(9.0)}
-    own, lost = {"irf_tail": LEAST + over, "afterpulsing": LEAST + over / 2}, dict.fromkeys(table, 400.0)
+    own, lost = {"irf_tail": LEAST + over, "afterpulsing": 1.0}, dict.fromkeys(table, 400.0)
     world = World(monkeypatch, table, [candidate(n) for n in table], own, lost=lost)
     told = world.own_evidence
 
