@@ -119,7 +119,18 @@ def test_json_is_the_diagnosis(written, case):
             "seconds",
             "seed",
         ),
-        *("witness", "profiles", "needed", "chance", "notes", "capture", "toys", "further", "likely"),
+        *(
+            "witness",
+            "profiles",
+            "needed",
+            "chance",
+            "notes",
+            "capture",
+            "toys",
+            "further",
+            "likely",
+            "along",
+        ),
     }
     assert set(read["unexplained"]) == {"significant", "axis", "evidence"}
     for effect in [*read["effects"], *read["unknown"]]:
