@@ -415,7 +415,7 @@ class Loop:
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
         terms must be asked for as much as they need beside such a scene when it has become fine, but for free
-        ones that hold by what they predict, and numbers of single spots. Not effects that account for most of
+        ones that hold by what they predict, and numbers of single spots. Not those that account for most of
         the misfit which this leaves: beside a scene that imitates a strong one, or fails without it, the
         counts ask for it no more.
 
@@ -455,17 +455,16 @@ class Loop:
         return found
 
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
-        """An effect of a scene accounts for most of the misfit of a fine one without it.
+        """A term of a scene accounts for most of the misfit of a fine one without it.
 
         Other spots are predicted better with it, which cells that are too wide do not bring about, but for
         the chance of a false name: by half of that misfit, or its own evidence is more than all of it. What
-        is missing for unknown reasons looks less like one effect than that.
+        is missing for unknown reasons looks less like one term than that.
         """
-        if not self.predicts(scene, fine, 1 - self.settings.level):
-            return False
-        select = self.split.select
-        gain = float((log_likelihood(scene, select) - log_likelihood(fine, select)).sum())
-        return evidence > self._misfit(fine) or gain > HALF * misfit_of(fine, select, len(select))
+        before, value = (log_likelihood(fit, self.split.select) for fit in (fine, scene))
+        _, weight, explained = self._gained(fine, before, value)
+        sure = weight > 1 - self.settings.level
+        return sure and (explained > HALF or evidence > self._misfit(fine))
 
     def _beside(self, fine: SurfelFit, name: str, kept: str) -> float:
         """Nats that a term has beside a fine scene without it: cells too wide for a scene ask for terms that
