@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 
 
@@ -108,13 +109,17 @@ class _Convolution(torch.autograd.Function):
         ctx.save_for_forward(transients, kernel)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
         transients, kernel = ctx.saved_tensors
         bins, size = transients.shape[1], _whole(transients, kernel)
         pull = torch.fft.rfft(torch.nn.functional.pad(grad, (ctx.lead, 0)), size)
-        of_light = torch.fft.irfft(pull * torch.fft.rfft(kernel, size).conj(), size)[:, :bins]
-        of_kernel = (pull * torch.fft.rfft(transients, size).conj()).sum(0)
-        return of_light, torch.fft.irfft(of_kernel, size)[: len(kernel)], None
+        of_light = of_kernel = None
+        if ctx.needs_input_grad[0]:
+            of_light = torch.fft.irfft(pull * torch.fft.rfft(kernel, size).conj(), size)[:, :bins]
+        if ctx.needs_input_grad[1]:
+            both = (pull * torch.fft.rfft(transients, size).conj()).sum(0)
+            of_kernel = torch.fft.irfft(both, size)[: len(kernel)]
+        return of_light, of_kernel, None
 
     @staticmethod
     def jvp(ctx: Any, d_transients: Tensor | None, d_kernel: Tensor | None, _: None) -> Tensor:
@@ -128,6 +133,6 @@ class _Convolution(torch.autograd.Function):
 
 
 def _whole(transients: Tensor, kernel: Tensor) -> int:
-    """Bins of the transforms: an even number, into which the whole convolution fits."""
+    """Bins of the transforms: the whole convolution fits into an even number without primes above 5."""
     size = transients.shape[1] + len(kernel) - 1
-    return size + size % 2
+    return 2 * next_fast_len(-(-size // 2), real=True)
