@@ -32,6 +32,7 @@ class Afterpulsing(Effect):
     """
 
     name = "afterpulsing"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="afterpulsing (counts that trigger further counts)",
         cause="Carriers trapped in the detector are released later and are counted again.",

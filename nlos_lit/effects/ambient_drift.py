@@ -34,6 +34,7 @@ class AmbientDrift(SmoothEffect):
     """
 
     name = "ambient_drift"
+    followed_by = ("free_scan_background",)
     words = EffectWords(
         phrase="an ambient light that changes during the scan",
         cause="Lamps, screens or daylight changed while the wall was scanned.",

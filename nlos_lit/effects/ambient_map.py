@@ -29,6 +29,7 @@ class AmbientMap(SmoothEffect):
     """
 
     name = "ambient_map"
+    followed_by = ("free_wall_background",)
     words = EffectWords(
         phrase="a background that differs over the wall",
         cause="Lamps, windows or screens light parts of the wall.",

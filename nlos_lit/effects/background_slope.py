@@ -28,6 +28,7 @@ class BackgroundSlope(Effect):
     """
 
     name = "background_slope"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="a background that rises or falls over the time gate",
         cause="Slow light (fluorescence, the laser's pedestal) or a detector that recovers after the "

@@ -28,6 +28,7 @@ class ClockScale(Effect):
     """
 
     name = "clock_scale"
+    followed_by = ("free_wall_delay",)
     words = EffectWords(
         phrase="a time axis that is stretched",
         cause="The true width of a time bin is not the nominal one.",

@@ -51,6 +51,7 @@ class Crosstalk(Effect):
     """
 
     name = "crosstalk"
+    followed_by = ("free_response_scan",)
     words = EffectWords(
         phrase="light of an earlier spot in a spot's record",
         cause="The mirrors still move, or the counter still holds what it counted, when a spot's record "

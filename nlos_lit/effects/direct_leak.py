@@ -31,6 +31,7 @@ class DirectLeak(Effect):
     """
 
     name = "direct_leak"
+    followed_by = ("free_time",)
     with_power = ("amplitude",)
     words = EffectWords(
         phrase="direct light that leaks into the gate",

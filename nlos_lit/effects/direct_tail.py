@@ -46,6 +46,7 @@ class DirectTail(Effect):
     """
 
     name = "direct_tail"
+    followed_by = ("free_time", "free_wall_background")
     with_power = ("amplitude",)
     words = EffectWords(
         phrase="direct light that strays from the laser's spot into the gate",

@@ -49,6 +49,7 @@ class Effect(nn.Module, Hooks):
             it with the same values.
         imitated: real captures have it strongly, and a scene fitted without it imitates it by surfels. A
             diagnosis also builds a scene with all such effects from the first surfel on.
+        followed_by: free terms that can do what it does: they take any values where it follows an equation.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
@@ -63,6 +64,7 @@ class Effect(nn.Module, Hooks):
     per_spot: ClassVar[bool] = False
     in_runs: ClassVar[bool] = False
     lasting: ClassVar[bool] = False
+    followed_by: ClassVar[tuple[str, ...]] = ()
     with_power: ClassVar[tuple[str, ...]] = ()
     imitated: ClassVar[bool] = False
     hooks: ClassVar[frozenset[str]] = frozenset()

@@ -32,6 +32,7 @@ class GateEdges(Effect):
     """
 
     name = "gate_edges"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="a time gate with soft edges",
         cause="The detector is not fully sensitive right after the gate opens and before it closes.",

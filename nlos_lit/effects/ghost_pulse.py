@@ -29,6 +29,7 @@ class GhostPulse(Effect):
     """
 
     name = "ghost_pulse"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="a second, delayed pulse",
         cause="A reflection in the optics or a cable, or a post-pulse of the laser, repeats every return "

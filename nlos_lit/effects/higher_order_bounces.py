@@ -48,6 +48,7 @@ class HigherOrderBounces(Effect):
     """
 
     name = "higher_order_bounces"
+    followed_by = ("free_response_wall",)
     words = EffectWords(
         phrase="light that bounced twice inside the hidden scene",
         cause="Surfaces that face each other exchange light, which arrives later than any direct path "

@@ -48,6 +48,7 @@ class Hum(Effect):
     """
 
     name = "hum"
+    followed_by = ("free_scan_background",)
     words = EffectWords(
         phrase="a background that oscillates during the scan",
         cause="Lamps, screens or a power supply flicker; beaten with the time per spot they give bands.",

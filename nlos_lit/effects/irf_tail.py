@@ -30,6 +30,7 @@ class IrfTail(Effect):
     """
 
     name = "irf_tail"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="a slow detector tail",
         cause="In a silicon SPAD some carriers are born outside the junction and diffuse into it late.",

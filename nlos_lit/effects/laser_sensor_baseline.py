@@ -29,6 +29,7 @@ class LaserSensorBaseline(Effect):
     """
 
     name = "laser_sensor_baseline"
+    followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
         phrase="laser and sensor spots that do not coincide",

@@ -35,6 +35,7 @@ class LineDelay(SmoothEffect):
     """
 
     name = "line_delay"
+    followed_by = ("free_scan_delay", "free_wall_delay")
     words = EffectWords(
         phrase="a time zero that jumps from line to line of the scan",
         cause="Timing starts anew with each line: the trigger, the scanner's line clock, or the way each "

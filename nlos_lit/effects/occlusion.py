@@ -39,6 +39,7 @@ class Occlusion(Effect):
     """
 
     name = "occlusion"
+    followed_by = ("free_wall",)
     words = EffectWords(
         phrase="something opaque between the wall and the scene",
         cause="An object that returns no light itself shadows part of the scene for part of the wall.",

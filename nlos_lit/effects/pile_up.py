@@ -36,6 +36,7 @@ class PileUp(Effect):
     """
 
     name = "pile_up"
+    followed_by = ("free_rate",)
     words = EffectWords(
         phrase="pile-up (early photons hide later ones)",
         cause="The detector counts at most one photon a laser cycle, so a high rate distorts the histogram "

@@ -31,6 +31,7 @@ class PowerDrift(SmoothEffect):
     """
 
     name = "power_drift"
+    followed_by = ("free_scan",)
     words = EffectWords(
         phrase="a laser power that drifts during the scan",
         cause="Laser output or detector efficiency changes with temperature while the scan runs.",

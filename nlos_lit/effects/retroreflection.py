@@ -40,6 +40,7 @@ class Retroreflection(Effect):
     """
 
     name = "retroreflection"
+    followed_by = ("free_wall",)
     words = EffectWords(
         phrase="a retroreflecting hidden surface",
         cause="The surface sends light back to where it came from (tape, signs, safety vests): brightness "

@@ -29,6 +29,7 @@ class SpecularLobe(Effect):
     """
 
     name = "specular_lobe"
+    followed_by = ("free_wall",)
     words = EffectWords(
         phrase="a glossy hidden surface",
         cause="Part of the light is reflected around the mirror direction, so spots that face the surface "

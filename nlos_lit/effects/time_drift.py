@@ -32,6 +32,7 @@ class TimeDrift(SmoothEffect):
     """
 
     name = "time_drift"
+    followed_by = ("free_scan_delay",)
     words = EffectWords(
         phrase="a time zero that drifts during the scan",
         cause="Laser trigger and timing electronics wander as they warm up.",

@@ -28,6 +28,7 @@ class TimeOffset(Effect):
     """
 
     name = "time_offset"
+    followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
         phrase="a wrong time zero",

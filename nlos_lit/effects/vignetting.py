@@ -30,6 +30,7 @@ class Vignetting(Effect):
     """
 
     name = "vignetting"
+    followed_by = ("free_wall",)
     words = EffectWords(
         phrase="a brightness that changes from the middle of the scan to its edge",
         cause="Lens, mirrors or an aperture pass less light at the edge of the field.",

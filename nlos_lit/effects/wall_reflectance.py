@@ -29,6 +29,7 @@ class WallReflectance(SmoothEffect):
     """
 
     name = "wall_reflectance"
+    followed_by = ("free_wall",)
     lasting = True
     words = EffectWords(
         phrase="a relay wall that is brighter in some places than in others",

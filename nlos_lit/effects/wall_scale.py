@@ -40,6 +40,7 @@ class WallScale(Effect):
     """
 
     name = "wall_scale"
+    followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
         phrase="a scan that is larger or smaller than stated",

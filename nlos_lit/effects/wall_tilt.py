@@ -28,6 +28,7 @@ class WallTilt(Effect):
     """
 
     name = "wall_tilt"
+    followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
         phrase="a relay wall that is tilted against the scan's plane",

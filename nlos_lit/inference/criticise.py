@@ -742,13 +742,35 @@ def criticise(
         found.pools.append(loop.ask(coarse, s.most - len(found.members), effects))
         return found.pools[-1]
 
+    def tell(members: list[Member]) -> None:
+        now = {m.name: m for m in members}
+        found.members = [now.get(m.name, m) for m in found.members]
+
+    def held_by(new: list[Member]) -> tuple[list[Member], SurfelFit, SurfelFit]:
+        """Who of those that came holds beside what is held, and the fine and the parsimonious scene."""
+        grown = loop.better(loop.fine(coarse, "with_all"), coarse)
+        tried, scene, left = loop.hold(new, grown, coarse, held)
+        tell(tried)
+        return [m for m in tried if m.stays], scene, left or coarse
+
     pool = asked(effects=True)
-    coarse, new = loop.begun(base, first, pool)
+    if (leads := pool.foreign) is not None:
+        before, found.members = pool, [Member(leads)]
+        coarse = loop.joined(base, [leads])
+        told(first, coarse, found.members)
+        pool = asked(effects=True)
+        rivals = [c for c in lost(before.candidates, pool.candidates, loop.least) if c.free]
+        held = Held(*held_by([Member(leads, rivals)]))
+        if not held.members:
+            held, coarse, pool, found.members = Held([], first, base), base, before, []
+    start, new = held, list[Member]()
+    if not start.members:
+        coarse, new = loop.begun(base, first, pool)
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)
         new = [replace(m, rivals=rivals) for m in new]
-        found.members = list(new)
+        found.members = found.members + new
         told(first, coarse, found.members)
     doubted: Held | None = None
     for free in (False, True):
@@ -758,22 +780,18 @@ def criticise(
             told(first, coarse, found.members)
             pool = asked(effects=not free)
         if new:
-            grown = loop.better(loop.fine(coarse, "with_all"), coarse)
-            tried, scene, left = loop.hold(new, grown, coarse, held)
-            now = {m.name: m for m in tried}
-            found.members = [now.get(m.name, m) for m in found.members]
-            kept = [m for m in found.present if doubted is None or m.name in now]
-            held = Held(kept, scene, left or coarse)
-            if kept and not free and not loop.predicts(scene, first):
-                doubted, held = held, Held([], first, base)  # what something unknown does may stand for them
+            kept, scene, left = held_by(new)
+            held = Held(held.members + kept, scene, left)
+            if kept and not free and not loop.predicts(scene, start.scene):
+                doubted, held = held, start  # what something unknown does may stand for them
         if held.coarse is not coarse and not free:
             coarse = held.coarse
             pool = asked(effects=False)
         new = []
-    if doubted is not None and not held.members:
+    if doubted is not None and held.members == start.members:
         held = doubted
     elif doubted is not None:
-        less = {m.name for m in doubted.members}
+        less = {m.name for m in doubted.members} - {m.name for m in start.members}
         found.members = [
             replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members
         ]

@@ -103,10 +103,14 @@ class Pool:
     Args:
         candidates: every term that the fit does not have yet, most evidence first.
         together: terms that are asked for beside each other, see :func:`together`.
+        foreign: the free term that is surely asked for more than any effect and does what none of those can
+            that are asked for most; None where there is none. It stands for something unknown, and they for
+            what they share with that.
     """
 
     candidates: list[Candidate]
     together: list[Taken]
+    foreign: Candidate | None = None
 
 
 def tested_rows(fit: SurfelFit, split: Split, most: int, seed: int) -> np.ndarray:
@@ -185,7 +189,27 @@ def ask(
     have = {e.name for e in fit.extension.effects}
     terms = [e for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
     found = screen(problem, [e(scan) for e in terms if e.name not in have], block, projector)
-    return Pool(found, together(problem, projector, block, found, least, room, effects))
+    taken = together(problem, projector, block, found, least, room, effects)
+    return Pool(found, taken, foreign(found, least) if effects and room else None)
+
+
+def foreign(candidates: list[Candidate], least: float) -> Candidate | None:
+    """The free term that goes before all effects, see :class:`Pool`.
+
+    Args:
+        candidates: the pool.
+        least: nats that a term needs, and by which the free term must be asked for more than any effect.
+
+    Returns:
+        it, or None.
+    """
+    effects = [c for c in candidates if not c.free]
+    best = max((c.evidence for c in effects), default=0.0)
+    if best <= least:
+        return None  # free terms are asked for where no effect is
+    does = {name for c in effects if c.evidence > MOST * best for name in c.effect.followed_by}
+    free = [c for c in candidates if c.free and not c.effect.per_spot and c.name not in does]
+    return next((c for c in free if c.evidence > best + least), None)
 
 
 def together(

@@ -30,7 +30,7 @@ from nlos_lit.inference.criticise import (
 )
 from nlos_lit.inference.heldout import compare
 from nlos_lit.inference.members import Findings, Member, Trial, chosen, group_of, weighed
-from nlos_lit.inference.pool import Candidate, Pool, Taken
+from nlos_lit.inference.pool import Candidate, Pool, Taken, foreign
 
 SCAN = Scan.of(capture_of(scattered(12)))
 SPLIT = SimpleNamespace(select=np.arange(120), fit=np.arange(300), block=BLOCK)
@@ -140,7 +140,8 @@ class World:
         named = [c for c in asked if c.name not in FREE_NAMES]
         asked = ((effects and named) or [c for c in asked if c.name in FREE_NAMES])[:room]
         rivals = {n: [candidate(r) for r in names] for n, names in self.rivals.items()}
-        return Pool(found, [Taken(c, rivals.get(c.name, [])) for c in asked])
+        leads = foreign(found, least) if effects and room else None
+        return Pool(found, [Taken(c, rivals.get(c.name, [])) for c in asked], leads)
 
     def own_evidence(
         self, fit: FakeFit, split, most, seed, names: list[str], bar
@@ -386,6 +387,53 @@ def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
         assert world.grown[:3] == [set(), {"irf_tail", "pile_up"}, {"irf_tail"}]
         assert world.grown[3:] == [set(), {"irf_tail", "free_time"}], "without it once, and not again"
         assert world.asked == [["irf_tail", "pile_up"], ["irf_tail"], ["free_time"]]
+
+
+def test_what_something_unknown_does_is_not_put_down_to_effects(monkeypatch):
+    """A free term that is asked for more than all effects, and does what none of them can, comes first by
+    itself; effects are asked for beside it. If it does not hold all is as it would be without it.
+    """
+    pool = [candidate("free_rate", 400.0), candidate("irf_tail", 300.0), candidate("pile_up", 20.0)]
+    for gained in (30.0, -1.0):
+        table = {"free_rate": gaining(gained), "irf_tail": gaining(40.0, 1), "pile_up": gaining(-1.0)}
+        world = World(monkeypatch, table, pool, {"pile_up": 1.0}, imitated=("irf_tail",))
+        found = world.criticise(CriticismSettings(processes=1, most=3))
+        assert next(names for names, _ in world.rebuilt if names) == {"free_rate"}
+        holding = {"free_rate", "irf_tail"} if gained > 0 else {"irf_tail"}
+        assert {m.name for m in found.accepted} == found.final.names == found.again.names == holding
+        assert names_of(found.members).count("free_rate") <= 1
+        begun = [names for names, _ in world.rebuilt if names == {"irf_tail"}]
+        assert bool(begun) == ("free_rate" not in holding), "nothing is imitated where something unknown is"
+
+
+@pytest.mark.parametrize(
+    ("evidence", "effect", "first"),
+    [
+        (LEAST + 100.1, "irf_tail", True),
+        (LEAST + 99.9, "irf_tail", False),
+        (LEAST + 100.1, "pile_up", False),
+    ],
+)
+def test_which_free_term_goes_before_all_effects(evidence, effect, first):
+    """It is asked for more than any by what a term needs, and what bends with the count rate may be what no
+    tail does, but a pile-up. Effects with less than nine tenths of the most say nothing of that.
+    """
+    others = [candidate("free_wall", 50.0), candidate(effect, 100.0), candidate("hum", 60.0)]
+    found = [candidate("free_rate", evidence), *others]
+    leads = foreign(found, LEAST)
+    assert (leads is not None and leads.name == "free_rate") == first
+    assert (leads is None) != first
+    for near, still in ((90.1, False), (89.9, first)):
+        beside = [*found, candidate("pile_up", near)] if effect != "pile_up" else found
+        assert (foreign(beside, LEAST) is not None) == still
+    assert foreign([candidate("free_rate", 400.0), candidate("hum", LEAST - 0.1)], LEAST) is None
+    assert foreign([candidate("free_spot_gain", 400.0), *others], LEAST) is None
+
+
+def test_free_terms_that_follow_effects_are_there():
+    for effect in EFFECTS:
+        assert set(effect.followed_by) <= FREE_NAMES, effect.name
+        assert bool(effect.followed_by) != effect.per_spot, effect.name
 
 
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
