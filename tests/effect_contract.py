@@ -16,6 +16,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import STAGES, Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.effects.hooks import HOOKS
 from nlos_lit.effects.nominal import numbers_of
 from nlos_lit.effects.page import sections
@@ -174,6 +175,10 @@ class EffectContract:
             assert there is not None, f"{other} is not in the registry"
             assert built.name not in there.split_by
             assert EFFECTS.splitting(built.name, other) == EFFECTS.splitting(other, built.name) == measurement
+
+    def test_which_free_terms_do_what_it_does(self, built: type[Effect]) -> None:
+        assert set(built.followed_by) <= FREE_NAMES
+        assert bool(built.followed_by) != built.per_spot, "but for numbers of single spots there are some"
 
     def test_typical_strength(self, at_null: Effect) -> None:
         """It can be given, as each of its numbers alone can, and says what was given."""

@@ -438,6 +438,7 @@ class {title}({form.__name__}, {place.__name__}):
     """
 
     name = "{formula.name}"
+    followed_by = ("{formula.free.name}",)
     words = EffectWords(
         phrase="{words.phrase}",
         cause="{words.cause}",

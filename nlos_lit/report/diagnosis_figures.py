@@ -313,16 +313,14 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
 
 @styled
 def deviance_steps(diagnosis: Diagnosis) -> Figure:
-    """Deviance per bin after each accepted term, and on the untouched spots; grey: counting noise."""
+    """Deviance per bin without any term, without each and with all, and of untouched spots; grey: noise."""
     base, extended, test = diagnosis.base, diagnosis.extended, diagnosis.untouched_test
     steps = [("base", base.deviance_per_bin)]
-    terms = sorted(
-        [*diagnosis.effects, *diagnosis.unknown],
-        key=lambda t: np.nan_to_num(t.heldout_gain.deviance_per_bin_before),
-        reverse=True,
-    )
-    steps += [(f"+ {t.name}", t.heldout_gain.deviance_per_bin_after) for t in terms]
-    steps += [("all together", extended.deviance_per_bin)] if terms else []
+    terms = [*diagnosis.effects, *diagnosis.unknown]
+    fewer = [(f"without {t.name}", t.heldout_gain.deviance_per_bin_before) for t in terms]
+    if len(terms) > 1:
+        steps += sorted(fewer, key=lambda step: np.nan_to_num(step[1]), reverse=True)
+    steps += [("with all", extended.deviance_per_bin)] if terms else []
     figure = Figure(figsize=(max(5.0, 1.1 * (len(steps) + 3)), 3.6))
     axes = figure.subplots()
     last = extended.deviance_noise if np.isfinite(extended.deviance_noise) else base.deviance_noise
@@ -348,7 +346,7 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
         x = start + np.arange(len(points))
         y = np.array([value for _, value in points], dtype=float)
         axes.vlines(x, noise, y, color=colour, alpha=0.35, linewidth=9)
-        axes.plot(x, y, "o-", color=colour, label=label)
+        axes.plot(x, y, "o", color=colour, label=label)
         axes.hlines(
             noise,
             x - 0.35,
@@ -363,7 +361,9 @@ def deviance_steps(diagnosis: Diagnosis) -> Figure:
             )
         ticks += list(x)
     labels = [
-        name.replace("_", "_\n") if len(name) > 14 else name for _, points, *_ in groups for name, _ in points
+        name.replace("without ", "without\n").replace("_", "_\n") if len(name) > 14 else name
+        for _, points, *_ in groups
+        for name, _ in points
     ]
     axes.set_xticks(ticks, labels=labels, fontsize="small")
     levels = [

@@ -47,7 +47,8 @@ CAPTIONS = {
     " last model only.",
     "residual_scan": "Residual in the order in which the spots were recorded.",
     "residual_rate": "Residual against how bright a spot is.",
-    "deviance": "Misfit after each accepted effect or free term, and on spots that nothing was chosen with."
+    "deviance": "Misfit without any, without each and with all of what was accepted, and on spots that "
+    "nothing was chosen with."
     " Grey: only counting noise is left.",
     "effects": "Parameters of the accepted effects and free terms.",
     "screening": "How much the counts ask for every known effect and free term by itself, before any was"
@@ -188,7 +189,7 @@ def report_html(
         _section("What cannot be told apart here", _groups(diagnosis)) if diagnosis.groups else "",
         *(_section(f"What {_text(one.name)} says of it", _further(one)) for one in diagnosis.further),
         _section("Where simulation and measurement differ", _calm(diagnosis) + shown("residual_")),
-        _section("The gain, step by step", _scores(diagnosis) + shown("deviance", "effects")),
+        _section("The gain", _scores(diagnosis) + shown("deviance", "effects")),
         _section("Every known effect and free term, tested", shown("screening") + _screened(diagnosis))
         if diagnosis.screened
         else "",

@@ -430,12 +430,6 @@ def test_which_free_term_goes_before_all_effects(evidence, effect, first):
     assert foreign([candidate("free_spot_gain", 400.0), *others], LEAST) is None
 
 
-def test_free_terms_that_follow_effects_are_there():
-    for effect in EFFECTS:
-        assert set(effect.followed_by) <= FREE_NAMES, effect.name
-        assert bool(effect.followed_by) != effect.per_spot, effect.name
-
-
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
     """The one that was gone on with, or one from new seeds, where surfels that imitated the terms do not come
     back; none where no surfel survives.
