@@ -29,6 +29,7 @@ from nlos_lit.functional.surfel_paths import (
     spline_weights,
     spread,
 )
+from nlos_lit.functional.surfel_visibility import who_hides
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import HIDING, Lateral, SurfelModel, spline_sensor, unknown_opacity
 
@@ -381,6 +382,21 @@ def test_fine_surfels_are_looked_at_in_the_middle_alone(bins, points):
     model.update_hiders()
     assert model.hiders.shape == (1, 1, 2, points)
     assert (model.hiders[0, 0, 1] == 1).all()
+
+
+@pytest.mark.parametrize(("bins", "drawn"), [(0.5, 1), (0.52, 2), (1.0, 2), (1.02, 3), (2.5, 5), (9.0, 5)])
+def test_surfels_are_drawn_by_points_half_a_bin_apart(monkeypatch, bins, drawn):
+    """At most five along each side: the widest surfels have the coarsest outlines."""
+    capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    model, given = build(capture, [[0.0, 0.0, 0.5]], cell=bins * capture.bin_length), []
+
+    def watched(*args) -> torch.Tensor:
+        given.append(args[-1])
+        return who_hides(*args)
+
+    monkeypatch.setattr("nlos_lit.surfels.model.who_hides", watched)
+    model.update_hiders()
+    assert given == [drawn]
 
 
 def test_light_is_hidden_from_laser_and_from_sensor():
