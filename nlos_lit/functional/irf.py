@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import torch
-from scipy.fft import next_fast_len
 from torch import Tensor
 
 
@@ -133,6 +133,27 @@ class _Convolution(torch.autograd.Function):
 
 
 def _whole(transients: Tensor, kernel: Tensor) -> int:
-    """Bins of the transforms: the whole convolution fits into an even number without primes above 5."""
-    size = transients.shape[1] + len(kernel) - 1
-    return 2 * next_fast_len(-(-size // 2), real=True)
+    """Bins of the transforms, into which the whole convolution fits."""
+    return fast_length(transients.shape[1] + len(kernel) - 1)
+
+
+@cache
+def fast_length(least: int) -> int:
+    """The first even number without a prime above 5, which transforms are fast for.
+
+    Args:
+        least: from which on, at least 1.
+
+    Examples:
+        >>> fast_length(926), fast_length(960), fast_length(961)
+        (960, 960, 972)
+    """
+    length = least + least % 2
+    while True:
+        left = length
+        for prime in (2, 3, 5):
+            while left % prime == 0:
+                left //= prime
+        if left == 1:
+            return length
+        length += 2
