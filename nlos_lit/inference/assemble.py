@@ -256,8 +256,7 @@ def _screened(candidate: Candidate, least: float) -> Screened:
                 if p.size > 1
                 else float((p.null or 0.0) + p.scale * candidate.step[part])
             )
-        limit, null = float(visible * p.scale * error.square().mean().sqrt()), p.null or 0.0
-        detectable[p.name] = limit if limit <= max(p.upper - null, null - p.lower) else math.inf
+        detectable[p.name] = float(visible * p.scale * error.square().mean().sqrt())
         start += p.size
     return Screened(
         name=effect.name,

@@ -147,7 +147,7 @@ class Screened:
         degrees: coefficients.
         one_step: estimated parameters. shape: scanned ones.
         detectable: the smallest amplitude of each parameter that this capture would reveal in nine of ten
-            cases; infinite where that is beyond the parameter's bounds.
+            cases.
     """
 
     name: str
