@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from nlos_lit.functional.even_convolution import next_fast_length
 
 
 def emg_cdf(time: Tensor, sigma: Tensor, kappa: Tensor) -> Tensor:
@@ -133,27 +134,6 @@ class _Convolution(torch.autograd.Function):
 
 
 def _whole(transients: Tensor, kernel: Tensor) -> int:
-    """Bins of the transforms, into which the whole convolution fits."""
-    return fast_length(transients.shape[1] + len(kernel) - 1)
-
-
-@cache
-def fast_length(least: int) -> int:
-    """The first even number without a prime above 5, which transforms are fast for.
-
-    Args:
-        least: from which on, at least 1.
-
-    Examples:
-        >>> fast_length(926), fast_length(960), fast_length(961)
-        (960, 960, 972)
-    """
-    length = least + least % 2
-    while True:
-        left = length
-        for prime in (2, 3, 5):
-            while left % prime == 0:
-                left //= prime
-        if left == 1:
-            return length
-        length += 2
+    """Bins of the transforms: the whole convolution fits, and even lengths are several times faster."""
+    size = transients.shape[1] + len(kernel) - 1
+    return 2 * next_fast_length(-(-size // 2))

@@ -742,15 +742,12 @@ def criticise(
         found.pools.append(loop.ask(coarse, s.most - len(found.members), effects))
         return found.pools[-1]
 
-    def tell(members: list[Member]) -> None:
-        now = {m.name: m for m in members}
-        found.members = [now.get(m.name, m) for m in found.members]
-
     def held_by(new: list[Member]) -> tuple[list[Member], SurfelFit, SurfelFit]:
         """Who of those that came holds beside what is held, and the fine and the parsimonious scene."""
         grown = loop.better(loop.fine(coarse, "with_all"), coarse)
         tried, scene, left = loop.hold(new, grown, coarse, held)
-        tell(tried)
+        now = {m.name: m for m in tried}
+        found.members = [now.get(m.name, m) for m in found.members]
         return [m for m in tried if m.stays], scene, left or coarse
 
     pool = asked(effects=True)
@@ -788,10 +785,10 @@ def criticise(
             coarse = held.coarse
             pool = asked(effects=False)
         new = []
-    if doubted is not None and held.members == start.members:
+    if doubted is not None and len(held.members) == len(start.members):
         held = doubted
     elif doubted is not None:
-        less = {m.name for m in doubted.members} - {m.name for m in start.members}
+        less = {m.name for m in doubted.members[len(start.members) :]}
         found.members = [
             replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members
         ]

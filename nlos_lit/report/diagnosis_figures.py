@@ -59,7 +59,7 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, Figure]:
     for term in diagnosis.unknown:
         if term.shape is not None:
             shown[f"unknown_{term.name}"] = free_shape(term.name, term.shape, bin_length, term.formula)
-    shown["deviance"] = deviance_steps(diagnosis)
+    shown["deviance"] = deviances(diagnosis)
     terms = [*diagnosis.effects, *diagnosis.unknown]
     if any(term.parameters for term in terms):
         shown["effects"] = accepted_effects(terms, bin_length)
@@ -312,7 +312,7 @@ def accepted_effects(effects: Sequence[Accepted], bin_length: float | None = Non
 
 
 @styled
-def deviance_steps(diagnosis: Diagnosis) -> Figure:
+def deviances(diagnosis: Diagnosis) -> Figure:
     """Deviance per bin without any term, without each and with all, and of untouched spots; grey: noise."""
     base, extended, test = diagnosis.base, diagnosis.extended, diagnosis.untouched_test
     steps = [("base", base.deviance_per_bin)]

@@ -47,9 +47,8 @@ CAPTIONS = {
     " last model only.",
     "residual_scan": "Residual in the order in which the spots were recorded.",
     "residual_rate": "Residual against how bright a spot is.",
-    "deviance": "Misfit without any, without each and with all of what was accepted, and on spots that "
-    "nothing was chosen with."
-    " Grey: only counting noise is left.",
+    "deviance": "Misfit without any, without each and with all of what was accepted, and on spots that"
+    " nothing was chosen with. Grey: only counting noise is left.",
     "effects": "Parameters of the accepted effects and free terms.",
     "screening": "How much the counts ask for every known effect and free term by itself, before any was"
     " accepted.",

@@ -75,17 +75,17 @@ def test_screening_bars_hatch_what_is_barely_identifiable():
 
 
 def test_deviance_without_each_term_and_of_the_untouched_spots():
-    axes = plots.deviance_steps(CASES["two"]).axes[0]
+    axes = plots.deviances(CASES["two"]).axes[0]
     heldout, untouched = axes.lines[:2]
     np.testing.assert_allclose(heldout.get_ydata(), [1.2417, 1.2417, 1.1903, 1.0351])
     np.testing.assert_allclose(untouched.get_ydata(), [1.3, 1.03])
-    both = plots.deviance_steps(two_found(unknown=[free("free_wall", "wall")])).axes[0]
+    both = plots.deviances(two_found(unknown=[free("free_wall", "wall")])).axes[0]
     labels = [label.get_text().replace("\n", "") for label in both.get_xticklabels()]
     assert labels[:5] == ["base", "withoutirf_tail", "withoutwall_tilt", "withoutfree_wall", "with all"]
     (one,) = two_found().effects[:1]
-    alone = plots.deviance_steps(dataclasses.replace(two_found(), effects=[one])).axes[0]
+    alone = plots.deviances(dataclasses.replace(two_found(), effects=[one])).axes[0]
     assert [label.get_text() for label in alone.get_xticklabels()][:2] == ["base", "with all"]
-    low, high = plots.deviance_steps(CASES["nothing"]).axes[0].get_ylim()
+    low, high = plots.deviances(CASES["nothing"]).axes[0].get_ylim()
     assert (0.7219 - 0.7113) / (high - low) < 0.15  # 1.5 % above noise is drawn small
 
 
