@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from nlos_lit.functional import sheet_loops
+from nlos_lit.functional.compiled import compiled, numpy_of
 
 NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to exp(-1/2)
 RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present normal by far, none do not
@@ -181,6 +184,8 @@ def carry_along(sheet: Sheet, shift: Tensor) -> Tensor:
         >>> [round(x, 2) for x in carry_along(sheet, torch.tensor([1.0, 0.0, 2.0])).tolist()]
         [0.5, 0.5, 2.0]
     """
+    if compiled(shift):
+        return _Carried.apply(shift, sheet)
     i, j = sheet.pairs
     for _ in range(AVERAGES):
         shift = (sheet.own * shift).index_add(0, i, sheet.mean * shift.index_select(0, j))
@@ -216,6 +221,8 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
         >>> [round(x, 2) for x in sheet_normals(sheet, risen)[1].tolist()]
         [0.64, 0.0, -0.77]
     """
+    if compiled(centre):
+        return _Normals.apply(centre, sheet)
     i, j = sheet.pairs
     d = centre.index_select(0, j) - centre.index_select(0, i)
     height = (d * sheet.normal.index_select(0, i)).sum(1) - sheet.rest
@@ -223,6 +230,48 @@ def sheet_normals(sheet: Sheet, centre: Tensor) -> Tensor:
     rim = sheet.outward.norm(dim=1).index_select(0, i)
     bow = rim * (_bow(planes, d, sheet.pairs) - sheet.bow)
     return _leaning(sheet, height + bow)
+
+
+class _Carried(torch.autograd.Function):
+    """:func:`carry_along`, compiled."""
+
+    @staticmethod
+    def forward(ctx: Any, shift: Tensor, sheet: Sheet) -> Tensor:
+        ctx.given = tuple(numpy_of(x) for x in (*sheet.pairs, sheet.mean, sheet.own))
+        return torch.from_numpy(sheet_loops.carried(*ctx.given, numpy_of(shift), AVERAGES))
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return torch.from_numpy(sheet_loops.pull_carried(*ctx.given, numpy_of(grad), AVERAGES)), None
+
+
+class _Normals(torch.autograd.Function):
+    """:func:`sheet_normals`, compiled."""
+
+    @staticmethod
+    def forward(ctx: Any, centre: Tensor, sheet: Sheet) -> Tensor:
+        given = (*sheet.pairs, centre, sheet.normal, sheet.first, sheet.second, sheet.share)
+        ctx.given, rim = [numpy_of(x) for x in given], numpy_of(sheet.outward.norm(dim=1))
+        found = sheet_loops.normals(*ctx.given, numpy_of(sheet.rest), numpy_of(sheet.bow), rim)
+        ctx.given += [rim, *found]
+        return torch.from_numpy(found[0])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        return torch.from_numpy(sheet_loops.pull_normals(*ctx.given, numpy_of(grad))), None
+
+
+class _Known(torch.autograd.Function):
+    """A cost whose gradients were worked out with it."""
+
+    @staticmethod
+    def forward(ctx: Any, cost: float, gradients: tuple[Tensor, ...], *of: Tensor) -> Tensor:
+        ctx.save_for_backward(*gradients)
+        return torch.tensor(cost, dtype=of[0].dtype)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        return (None, None, *(grad * gradient for gradient in ctx.saved_tensors))
 
 
 def rolled_off(normal: Tensor, outward: Tensor, roll: Tensor) -> Tensor:
@@ -295,11 +344,11 @@ def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
     Args:
         centre: ``[M, 3]`` m.
         normal: ``[M, 3]`` unit.
-        weight: ``[M]`` trust in each surfel; a pair counts their product.
+        weight: ``[M]`` trust in each surfel, a constant; a pair counts their product.
         pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
 
     Returns:
-        A scalar, differentiable in places, normals and weights.
+        A scalar, differentiable in places and normals.
 
     Examples:
         >>> import torch
@@ -309,6 +358,10 @@ def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
         >>> bending(centre, flat, torch.ones(2), pairs)
         tensor(0.)
     """
+    if compiled(centre):
+        given = (numpy_of(x) for x in (*pairs, centre, normal, weight))
+        cost, *gradients = sheet_loops.bending(*given, BEND, STIFFNESS)
+        return _Known.apply(cost, tuple(torch.from_numpy(g) for g in gradients), centre, normal)
     i, j = pairs
     trust = weight.index_select(0, i) * weight.index_select(0, j)
     return (trust * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
@@ -334,6 +387,31 @@ def level_of(albedo: Tensor) -> Tensor:
     ordered = albedo.detach().sort().values
     light = ordered.double().cumsum(0)
     return ordered[(light < LEVEL * light[-1]).sum()].clamp_min(1e-7)
+
+
+def albedo_cost(
+    albedo: Tensor, pairs: tuple[Tensor, Tensor], level: Tensor, evenness: float, bright: float, there: float
+) -> Tensor:
+    """The sum of what albedos cost, each with its weight.
+
+    Args:
+        albedo: ``[M]`` ≥ 0.
+        pairs: i and j ``[P]`` from :func:`neighbour_pairs`, both directions.
+        level: of the scene, from :func:`level_of`.
+        evenness: weight of :func:`albedo_steps` …
+        bright: … of :func:`brightness` …
+        there: … and of :func:`presence`.
+
+    Returns:
+        A scalar, differentiable in the albedos.
+    """
+    if not compiled(albedo):
+        steps = albedo_steps(albedo, pairs, level)
+        return evenness * steps + bright * brightness(albedo, level) + there * presence(albedo, level)
+    given = (numpy_of(x) for x in (*pairs, albedo))
+    constants = (float(level), evenness, bright, there, EDGE, ALIKE, BRIGHT, THERE)
+    cost, gradient = sheet_loops.albedo_costs(*given, *constants)
+    return _Known.apply(cost, (torch.from_numpy(gradient),), albedo)
 
 
 def albedo_steps(albedo: Tensor, pairs: tuple[Tensor, Tensor], level: Tensor) -> Tensor:

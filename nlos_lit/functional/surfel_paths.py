@@ -11,16 +11,19 @@ curved patch vary smoothly over it.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
 from torch import Tensor
+
+from nlos_lit.functional import path_loops, sheet_loops
+from nlos_lit.functional.compiled import compiled, in_threads, numpy_of
+from nlos_lit.functional.path_loops import EDGE
 
 STEEP = 0.4  # cosine of the tilt up to which a patch covers its whole lateral cell
 SPLINE_VARIANCE = 1 / 3  # bins²; exact at every sub-bin phase
-EDGE = 4  # bins on either side of a record that take what is lost
 # Shares of the four bins (rows) in powers of the phase, from the zeroth on: the cubic B-spline's pieces.
 PIECES = torch.tensor([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]], dtype=torch.float64).div_(
     6
@@ -131,6 +134,7 @@ def trace(
     sensor_normal: Tensor,
     confocal: bool,
     curvature: Tensor | None = None,
+    seen: Tensor | None = None,
 ) -> Paths:
     """All third-bounce paths of a batch of spots, laser → surfel → sensor (paper Eq. 6-7).
 
@@ -145,6 +149,7 @@ def trace(
         sensor_normal: ``[B, 3]`` unit normals there; not used when ``confocal``.
         confocal: whether the sensor looks at the laser's points.
         curvature: ``[M, 3, 3]`` 1/m, see :func:`on_patch`; None for flat patches.
+        seen: ``[B, M]`` share of each surfel's light that is not hidden; None where all is seen.
 
     Returns:
         Paths of B spots over M surfels with Q points each.
@@ -159,28 +164,104 @@ def trace(
         >>> round(paths.contribution.item(), 8), paths.length.item()
         (0.0001, 2.0)
     """
+    place, facing, share = patches(normal, cell, offsets, curvature)
+    # From the middle of the scene, so that differences of squares keep their digits, in any batch the same.
+    middle = centre.detach().mean(0)
+    points = centre[:, None] + place - middle
+    seen = points.new_ones(len(laser), len(centre)) if seen is None else seen
+    factor, leg, cosine = _legs(points, facing, laser - middle, laser_normal)
+    if confocal:
+        energy = _energies(share, seen, factor, factor)
+        return Paths(energy, 2 * leg, leg, leg, cosine, cosine, centre, normal, share.sum(1))
+    other, other_leg, other_cosine = _legs(points, facing, sensor - middle, sensor_normal)
+    energy, legs = _energies(share, seen, factor, other), (leg, other_leg, cosine, other_cosine)
+    return Paths(energy, leg + other_leg, *legs, centre, normal, share.sum(1))
+
+
+def patches(
+    normal: Tensor, cell: Tensor, offsets: Tensor, curvature: Tensor | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Points of patches.
+
+    Args:
+        normal: ``[M, 3]`` unit, at the centres.
+        cell: ``[2]`` lateral extents, m.
+        offsets: ``[Q, 2]`` from :func:`quadrature`.
+        curvature: ``[M, 3, 3]`` 1/m, see :func:`on_patch`, without gradients; None for flat patches.
+
+    Returns:
+        ``[M, Q, 3]`` places relative to the centres, normals there, and ``[M, Q]`` areas, m².
+    """
+    curvature = normal.new_zeros(0, 3, 3) if curvature is None or len(offsets) == 1 else curvature
+    plain = _Patches.apply if compiled(normal) else _patches
+    return plain(normal, cell, offsets, curvature)
+
+
+def _patches(
+    normal: Tensor, cell: Tensor, offsets: Tensor, curvature: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Tensor by tensor."""
     shift, area = spread(normal, cell, offsets)
-    share, facing = (area / len(offsets))[:, None], normal[:, None].expand_as(shift)
-    if curvature is not None and len(offsets) > 1:
+    share, facing = (area / len(offsets))[:, None].expand(shift.shape[:2]), normal[:, None].expand_as(shift)
+    if len(curvature):
         shift, facing = on_patch(normal, shift, curvature)
         # Where a patch covers its lateral cell, what leans more has more area.
         leans = (-facing[..., 2]).clamp_min(STEEP)
         share = share * (-normal[:, 2:]).clamp_min(STEEP) / leans
-    # From the middle of the scene, so that differences of squares keep their digits, in any batch the same.
-    middle = centre.detach().mean(0)
-    points = centre[:, None] + shift - middle
-    factor, leg, cosine = _leg(points, facing, laser - middle, laser_normal)
-    if confocal:
-        return Paths(share * factor**2, 2 * leg, leg, leg, cosine, cosine, centre, normal, area)
-    other, other_leg, other_cosine = _leg(points, facing, sensor - middle, sensor_normal)
-    legs = (leg, other_leg, cosine, other_cosine)
-    return Paths(share * factor * other, leg + other_leg, *legs, centre, normal, area)
+    return shift, facing, share
 
 
-def _leg(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points ``[B, 3]`` to ``[M, Q, 3]``.
+class _Loop(torch.autograd.Function):
+    """What a compiled loop works out; its forward derivative is that of the same tensor by tensor."""
 
-    Each is ``[B, M, Q]``. Squares of distances and distances from planes are sums of products of what belongs
+    plain: ClassVar[Callable[..., Any]]
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Any) -> None:
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @classmethod
+    def pushed(cls, ctx: Any, changes: tuple[Tensor | None, ...]) -> Any:
+        given = ctx.saved_tensors
+        towards = tuple(torch.zeros_like(x) if c is None else c for x, c in zip(given, changes, strict=True))
+        return torch.func.jvp(cls.plain, given, towards)[1]
+
+
+class _Patches(_Loop):
+    plain = staticmethod(_patches)
+
+    @staticmethod
+    def forward(normal: Tensor, cell: Tensor, offsets: Tensor, curvature: Tensor) -> tuple[Tensor, ...]:
+        shape = (len(normal), len(offsets))
+        place, facing, share = (normal.new_empty(*shape, *more) for more in ((3,), (3,), ()))
+        given = [numpy_of(x) for x in (normal, curvature, cell, offsets)]
+        sheet_loops.patches(*given, np.float32(STEEP), place.numpy(), facing.numpy(), share.numpy())
+        return place, facing, share
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        normal, cell, offsets, curvature = ctx.saved_tensors
+        given = [numpy_of(x) for x in (normal, curvature, cell, offsets)]
+        found = sheet_loops.pull_patches(*given, np.float32(STEEP), *(numpy_of(g) for g in grads))
+        return torch.from_numpy(found), None, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
+        return _Patches.pushed(ctx, changes)
+
+
+def _legs(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel ``[B, M, Q]`` of legs from wall points ``[B, 3]``, which
+    have no gradients, to points ``[M, Q, 3]``.
+    """
+    return (_Legs.apply if compiled(points) else _plain_legs)(points, facing, wall, normal)
+
+
+def _plain_legs(
+    points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Tensor by tensor. Squares of distances and distances from planes are sums of products of what belongs
     to the wall point and what belongs to the surfel, so that they are products of matrices.
     """
     flat, one = points.reshape(-1, 3), wall.new_ones(len(wall), 1)
@@ -194,6 +275,71 @@ def _leg(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[
     square, at_wall = square.clamp_min(1e-12).view(shape), at_wall.clamp_min(0).view(shape)
     plane, distance = plane.clamp_min(0).view(shape), torch.sqrt(square)
     return at_wall * plane / square**2, distance, plane / distance
+
+
+class _Legs(_Loop):
+    plain = staticmethod(_plain_legs)
+
+    @staticmethod
+    def forward(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, ...]:
+        found = points.new_empty(3, len(wall), *points.shape[:2])
+        rows = [numpy_of(x) for x in (wall, normal, *found.flatten(2))]
+        in_threads(path_loops.legs, found[0].numel(), rows, [_rows(points), _rows(facing)])
+        return tuple(found)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        points, facing, wall, normal = ctx.saved_tensors
+        found = points.new_zeros(2, 3, points.shape[:2].numel())
+        rows = [numpy_of(x) for x in (wall, normal, *(g.flatten(1) for g in grads))]
+        fixed, sums = [_rows(points), _rows(facing)], list(found.numpy())
+        in_threads(path_loops.pull_legs, grads[0].numel(), rows, fixed, sums)
+        of_points, of_facing = (x.T.reshape(points.shape) for x in found)
+        return of_points, of_facing, None, None
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
+        return _Legs.pushed(ctx, changes)
+
+
+def _energies(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
+    """What paths carry ``[B, M, Q]``: areas of points ``[M, Q]`` times what is seen of their surfels ``[B,
+    M]`` times the factors ``[B, M, Q]`` of both legs.
+    """
+    return (_Energies.apply if compiled(factor) else _plain_energies)(share, seen, factor, other)
+
+
+def _plain_energies(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
+    return share * seen[:, :, None] * factor * other
+
+
+class _Energies(_Loop):
+    plain = staticmethod(_plain_energies)
+
+    @staticmethod
+    def forward(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
+        energy = torch.empty_like(factor)
+        rows = [numpy_of(x) for x in (seen, *(x.flatten(1) for x in (factor, other, energy)))]
+        in_threads(path_loops.energies, energy.numel(), rows, [numpy_of(share.flatten())])
+        return energy
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
+        share, seen, factor, other = ctx.saved_tensors
+        found = torch.zeros_like(share), *(torch.empty_like(x) for x in (seen, factor, other))
+        many = [x.flatten(1) for x in (factor, other, grad, *found[1:])]
+        fixed, sums = [numpy_of(share.flatten())], [numpy_of(found[0].flatten())]
+        in_threads(path_loops.pull_energies, grad.numel(), [numpy_of(x) for x in (seen, *many)], fixed, sums)
+        return found
+
+    @staticmethod
+    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
+        return _Energies.pushed(ctx, changes)
+
+
+def _rows(points: Tensor) -> np.ndarray:
+    """``[3, N]`` from ``[…, 3]``."""
+    return numpy_of(points.reshape(-1, 3).T)
 
 
 def spline_weights(time: Tensor) -> tuple[Tensor, Tensor]:
@@ -255,6 +401,11 @@ class SplineSplat(torch.autograd.Function):
     @staticmethod
     def forward(contribution: Tensor, time: Tensor, n_bins: int) -> Tensor:
         """``[B, n_bins]`` in the unit of ``contribution``."""
+        if compiled(time):
+            padded = contribution.new_zeros(len(time), n_bins + path_loops.ROW)
+            rows = [numpy_of(x) for x in (contribution, time, padded)]
+            in_threads(path_loops.splat, time.numel(), rows)
+            return padded[:, EDGE : EDGE + n_bins].contiguous()
         place, f = _located(time, n_bins)
         first = contribution * f
         second = first * f
@@ -301,39 +452,59 @@ def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         >>> round(value.item(), 6), round(slope.item(), 6)  # a line is told as it is
         (2.5, 1.0)
     """
-    n_bins = image.shape[1]
+    n_bins, padded = image.shape[1], torch.nn.functional.pad(image, (EDGE, EDGE + 3))
+    if compiled(time):
+        value, slope = torch.empty_like(time), torch.empty_like(time)
+        rows = [numpy_of(padded), numpy_of(time), value.numpy(), slope.numpy()]
+        in_threads(path_loops.spline_values, time.numel(), rows)
+        return value, slope
     place, f = _located(time, n_bins)
-    padded = torch.nn.functional.pad(image, (EDGE, EDGE + 3))
     bins = torch.stack([padded[:, k : k + n_bins + 2 * EDGE].reshape(-1) for k in range(4)])
     tables = PIECES.to(image).T @ bins
     c0, c1, c2, c3 = (table.index_select(0, place).view(f.shape) for table in tables)
     return c0 + f * (c1 + f * (c2 + f * c3)), c1 + f * (2 * c2 + 3 * f * c3)
 
 
-def spline_matrix(contribution: Tensor, time: Tensor, n_bins: int) -> csr_array:
-    """:class:`SplineSplat` as a matrix, for light that arrives at the same times again and again.
-
-    Args:
-        contribution: ``[B, M, Q]`` of M sources with Q points each, per unit of a source's light.
-        time: ``[B, M, Q]`` in bins.
-        n_bins: T.
-
-    Returns:
-        ``[B·M, B·T]`` on the CPU; what leaves [0, T) is lost. Takes 32 bytes a point.
-
-    Examples:
-        >>> import torch
-        >>> spline_matrix(torch.ones(1, 1, 1), torch.full((1, 1, 1), 2.5), 5).toarray().round(2)
-        array([[0.  , 0.17, 0.67, 0.17, 0.  ]], dtype=float32)
+class Runs(NamedTuple):
+    """What the light of M sources does to the T bins of B spots, for light that arrives at the same times
+    again and again: each source's runs of bins, and their shares.
     """
-    (batch, sources, points), (first, weights) = time.shape, spline_weights(time)
-    into = first[..., None] + torch.arange(4, device=time.device)
-    inside = (into >= 0) & (into < n_bins)
-    row = torch.arange(batch, device=time.device)[:, None, None, None] * n_bins
-    column = (row + into.clamp(0, n_bins - 1)).to(torch.int32).reshape(-1).cpu().numpy()
-    value = (contribution[..., None] * weights * inside).reshape(-1).cpu().numpy()
-    begin = np.arange(batch * sources + 1, dtype=np.int32) * (4 * points)
-    return csr_array((value, column, begin), shape=(batch * sources, batch * n_bins))
+
+    begin: np.ndarray  # [B, M] in padded rows
+    block: np.ndarray  # [B, M + 1] of shares
+    share: np.ndarray  # [n, BLOCK]
+    bins: int
+
+    @classmethod
+    def of(cls, contribution: Tensor, time: Tensor, n_bins: int) -> Runs:
+        """:class:`SplineSplat` of sources that have many points each.
+
+        Args:
+            contribution: ``[B, M, Q]`` of M sources with Q points each, per unit of a source's light.
+            time: ``[B, M, Q]`` in bins.
+            n_bins: T.
+
+        Examples:
+            >>> runs = Runs.of(torch.ones(1, 1, 1), torch.full((1, 1, 1), 2.5), 5)
+            >>> runs.send(torch.tensor([6.0]))
+            tensor([[0., 1., 4., 1., 0.]])
+        """
+        given = [numpy_of(x.cpu()) for x in (contribution, time)]
+        begin, block, share = path_loops.runs(*given, np.float32(n_bins))
+        return cls(begin, block, share, n_bins)
+
+    def send(self, light: Tensor) -> Tensor:
+        """``[B, T]`` transients of sources of light ``[M]``; what leaves [0, T) is lost."""
+        padded = torch.zeros(len(self.begin), self.bins + path_loops.ROW + path_loops.BLOCK)
+        path_loops.send(self.begin, self.block, self.share, numpy_of(light.cpu()), padded.numpy())
+        return padded[:, EDGE : EDGE + self.bins].to(light.device)
+
+    def pull(self, grad: Tensor) -> np.ndarray:
+        """Gradient ``[M]`` of the light from that of the transients ``[B, T]``."""
+        padded = torch.nn.functional.pad(grad.cpu(), (EDGE, EDGE + 3 + path_loops.BLOCK))
+        found = np.zeros(self.begin.shape[1], np.float32)
+        path_loops.pull_send(self.begin, self.block, self.share, numpy_of(padded), found)
+        return found
 
 
 def _located(time: Tensor, n_bins: int) -> tuple[Tensor, Tensor]:

@@ -11,6 +11,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from nlos_lit.functional import view_loops
+from nlos_lit.functional.compiled import compiled, in_threads, numpy_of
 from nlos_lit.functional.surfel_paths import quadrature, spread
 
 PIXEL = 1.75  # widths of a patch by the points along each side: they lie farther apart on slanted ones
@@ -27,6 +29,7 @@ def who_hides(
     target: Tensor,
     drawn: int = 5,
     chunk: int = 1 << 20,
+    names: Tensor | None = None,
 ) -> Tensor:
     """The first patch that straight lines from wall points to targets pierce.
 
@@ -42,10 +45,11 @@ def who_hides(
         wall: ``[W, 3]`` wall points, m.
         target: ``[V, K, 3]`` m, points of each target.
         drawn: points along each side of a patch.
-        chunk: points and pixels worked on at once, bounds the memory.
+        chunk: points and pixels worked on at once where nothing is compiled, bounds the memory.
+        names: ``[M]`` int32 of the patches; None counts them from 1.
 
     Returns:
-        ``[W, V, K]`` int32, which patch; -1 where the view is clear.
+        ``[W, V, K]`` int32, name of the patch; 0 where the view is clear.
 
     Examples:
         A patch half-way hides what is straight behind it from the first wall point, not from the second:
@@ -54,14 +58,15 @@ def who_hides(
         >>> wall = torch.tensor([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0]])
         >>> behind = torch.tensor([[[0.0, 0.0, 1.0]]])
         >>> who_hides(half_way, towards, torch.tensor([0.1, 0.1]), wall, behind).flatten()
-        tensor([ 0, -1], dtype=torch.int32)
+        tensor([1, 0], dtype=torch.int32)
     """
-    found_by = target.new_full((len(wall), *target.shape[:2]), -1, dtype=torch.int32)
+    found_by = target.new_zeros((len(wall), *target.shape[:2]), dtype=torch.int32)
     if not len(centre):
         return found_by
     shift, _ = spread(normal, cell, quadrature(drawn, cell.device))
     points = (centre[:, None] + shift).reshape(-1, 3)
-    patch = torch.arange(len(centre), device=wall.device).repeat_interleave(drawn**2)
+    patch = torch.arange(len(centre), device=wall.device)
+    names, patch = (patch + 1).to(torch.int32) if names is None else names, patch.repeat_interleave(drawn**2)
     side, front = cell.max(), wall[:, 2].max()
     nearest = (torch.quantile(centre[:, 2], NEAR) - front).clamp_min(side)
     middle = target.mean(1)
@@ -81,6 +86,14 @@ def who_hides(
         drawn_at, depth = _seen_from(height, points, pixel)
         looked_at, own_depth = _seen_from(height, target, pixel)
         code = depth * STEPS + patch
+        if compiled(wall):
+            rows = torch.nonzero(wall[:, 2] == height)[:, 0]
+            order = code.argsort(descending=True)
+            fixed = (drawn_at[:, :, order], code[order], looked_at, own_depth * STEPS, middle, normal, level)
+            given = [*map(numpy_of, (*fixed, names, behind, found_by)), CLEAR * float(side), STEPS]
+            work = len(rows) * (len(code) + len(target))
+            in_threads(view_loops.pictures, work, [numpy_of(wall[rows]), numpy_of(rows)], given)
+            continue
         for rows in torch.nonzero(wall[:, 2] == height)[:, 0].split(size):
             part = wall[rows]
             tu, tv = _columns(part, looked_at, 0.0, 0.0)
@@ -98,8 +111,8 @@ def who_hides(
             own = (normal[hider] * middle).sum(2) - level[hider]
             eye = (part @ normal.T - level).gather(1, hider)
             hidden = at_front & (own * eye < 0) & (own.abs() > CLEAR * side)
-            by = torch.where(hidden, hider, -1).to(torch.int32).view(len(part), len(behind), -1)
-            found_by[rows[:, None], behind] = by
+            by = torch.where(hidden, names[hider], 0)
+            found_by[rows[:, None], behind] = by.view(len(part), len(behind), -1)
     return found_by
 
 

@@ -14,15 +14,13 @@ from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_graph import (
     Sheet,
-    albedo_steps,
+    albedo_cost,
     bending,
-    brightness,
     carry_along,
     curvature_of,
     lay_sheet,
     level_of,
     neighbour_pairs,
-    presence,
     rolled_off,
     sheet_normals,
 )
@@ -306,8 +304,7 @@ class SurfelModel(nn.Module):
         """
         own = self.albedo()
         level, albedo = level_of(own), own if albedo is None else albedo
-        steps = albedo_steps(albedo, self.pairs, level)
-        return evenness * steps + bright * brightness(albedo, level) + there * presence(albedo, level)
+        return albedo_cost(albedo, self.pairs, level, evenness, bright, there)
 
     def opacity(self) -> Tensor:
         """``[M]`` share of the light that a surfel keeps from what is behind it."""
@@ -327,6 +324,9 @@ class SurfelModel(nn.Module):
         """
         rows = torch.arange(len(self.laser), device=self.laser.device) if spots is None else spots
         found = self.hidden_by(rows, self.points_of(*self.placed()))
+        if spots is None:
+            self.hiders = found
+            return
         self.hiders = found.new_zeros(len(found), len(self.laser), *found.shape[2:])
         self.hiders[:, rows] = found
 
@@ -359,13 +359,14 @@ class SurfelModel(nn.Module):
         """
         centre, normal = self.placed()
         drawn = torch.nonzero(self.opacity() > HIDING)[:, 0]
-        number = torch.cat([drawn.new_zeros(1), drawn + 1]).to(torch.int32)
-        along = self._along(DRAWN, 5)
+        along, names = self._along(DRAWN, 5), (drawn + 1).to(torch.int32)
 
         def found(wall: Tensor) -> Tensor:
             points, row = torch.unique(wall, dim=0, return_inverse=True)
-            by = who_hides(centre[drawn], normal[drawn], self.cell, points, places, along)
-            return number.index_select(0, by.flatten() + 1).view(by.shape).index_select(0, row)
+            once = len(points) < len(wall)
+            given = (centre[drawn], normal[drawn], self.cell, points if once else wall, places, along)
+            by = who_hides(*given, names=names)
+            return by.index_select(0, row) if once else by
 
         legs = [self.laser] if self.confocal else [self.laser, self.sensor]
         return torch.stack([found(wall[spots]) for wall in legs])
@@ -395,11 +396,9 @@ class SurfelModel(nn.Module):
         """
         walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
-        paths = trace(*(placed or self.placed()), self.cell, offsets, *walls, self.confocal, self.curvature)
-        if len(self.hiders):
-            seen = self.arriving(self.hiders[:, spots])
-            paths = paths._replace(contribution=paths.contribution * seen[:, :, None])
-        return paths
+        centre, normal = placed or self.placed()
+        seen = self.arriving(self.hiders[:, spots]) if len(self.hiders) else None
+        return trace(centre, normal, self.cell, offsets, *walls, self.confocal, self.curvature, seen)
 
     def arrival(self, length: Tensor) -> Tensor:
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""

@@ -8,19 +8,20 @@ the likeliest albedo is zero.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
-from scipy.sparse import csr_array
 from torch import Tensor
 
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
+from nlos_lit.functional.compiled import side_by_side
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import flank, ring
-from nlos_lit.functional.surfel_paths import spline_matrix
+from nlos_lit.functional.surfel_paths import Runs
 from nlos_lit.surfels.growth import APART, best_apart, occupied, within_depths
 from nlos_lit.surfels.model import SurfelModel
 
@@ -77,7 +78,7 @@ class _Linear(NamedTuple):
     """What albedos have to do with the light that arrives at some spots, while all else stands still."""
 
     spots: Tensor  # [B]
-    splat: csr_array  # [B·M, B·T], transients by each surfel's albedo
+    runs: Runs  # of each surfel
     other: Tensor  # [B, T] light that arrives besides
 
     @classmethod
@@ -85,14 +86,9 @@ class _Linear(NamedTuple):
     def of(cls, model: SurfelModel, spots: Tensor, hooks: Hooks) -> _Linear:
         paths, albedo = model.paths(spots), model.albedo()
         energy, time = model.arrivals(paths, spots, hooks, torch.ones_like(albedo))
-        splat = spline_matrix(energy, time, model.n_bins)
-        direct = _arriving(splat, albedo.cpu().numpy(), len(spots)).to(albedo.device)
-        return cls(spots, splat, hooks.transients(direct, energy * albedo[:, None], paths, spots) - direct)
-
-
-def _arriving(splat: csr_array, albedo: np.ndarray, number: int) -> Tensor:
-    """``[B, T]`` light of albedos ``[M]`` at a number B of spots."""
-    return torch.from_numpy(splat.T @ np.tile(albedo, number)).view(number, -1)
+        runs = Runs.of(energy, time, model.n_bins)
+        direct = runs.send(albedo)
+        return cls(spots, runs, hooks.transients(direct, energy * albedo[:, None], paths, spots) - direct)
 
 
 def solve_albedos(
@@ -123,19 +119,18 @@ def solve_albedos(
     parts = [_Linear.of(model, part, hooks) for part in spots.split(size)]
     first = model.gate[0]
 
+    def misfit(sent: Tensor, part: _Linear, seen: Tensor) -> tuple[float, np.ndarray]:
+        arriving = (part.runs.send(sent) + part.other).requires_grad_()
+        expected = model.record(arriving, part.spots, hooks)[:, first:].clamp_min(1e-9).double()
+        nats = (expected - seen - torch.xlogy(seen.double(), expected / seen.clamp_min(1))).sum()
+        return float(nats.detach()), part.runs.pull(torch.autograd.grad(nats, arriving)[0])
+
     def cost(levels: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.tensor(levels, dtype=torch.float32, device=device, requires_grad=True)
         prior = model.albedo_cost(*weights, level * x)
         total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0].double().cpu().numpy()
-        sent = (level * levels).astype(np.float32)
-        for (part, splat, other), seen in zip(parts, counts.split(size), strict=True):
-            arriving = (_arriving(splat, sent, len(part)).to(device) + other).requires_grad_()
-            expected = model.record(arriving, part, hooks)[:, first:].clamp_min(1e-9).double()
-            nats = (expected - seen - torch.xlogy(seen.double(), expected / seen.clamp_min(1))).sum()
-            pull = torch.autograd.grad(nats, arriving)[0].reshape(-1).cpu().numpy()
-            slope += level * (splat @ pull).reshape(-1, m).sum(0)
-            total += float(nats.detach())
-        return total, slope
+        each = side_by_side(partial(misfit, level * x.detach()), parts, counts.split(size))
+        return total + sum(nats for nats, _ in each), slope + level * sum(pull for _, pull in each)
 
     begin = (model.albedo().detach() / level).double().cpu().numpy()
     found = minimize(

@@ -16,7 +16,7 @@ CELL = torch.tensor([0.1, 0.1])
 
 def clear_view(*scene, **options) -> torch.Tensor:
     """``[W, V, K]`` bool, where nothing hides a target."""
-    return who_hides(*scene, **options) < 0
+    return who_hides(*scene, **options) == 0
 
 
 def lattice(x: tuple[int, int], y: tuple[int, int], z: float) -> tuple[torch.Tensor, torch.Tensor]:
@@ -40,7 +40,7 @@ def test_a_second_sheet_hides_where_a_nearer_one_stands_aside():
     wall, target = torch.tensor([[0.9, 0.0, 0.0]]), torch.tensor([[-0.1, 0.0, 1.0]])
     # The line passes x = 0.5 beside the near sheet, and x = 0.1 through the far one, behind the near one.
     assert clear_view(*near, CELL, wall, target[:, None]).item()
-    by = int(who_hides(*both, CELL, wall, target[:, None]))
+    by = int(who_hides(*both, CELL, wall, target[:, None])) - 1
     assert by >= len(near[0])  # one of the far ones,
     assert (both[0][by, :2] - torch.tensor([0.1, 0.0])).abs().max() < 0.05 + 1e-6  # where the line pierces it
 

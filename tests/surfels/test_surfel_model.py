@@ -23,9 +23,9 @@ from nlos_lit.functional.surfel_graph import (
     neighbour_pairs,
 )
 from nlos_lit.functional.surfel_paths import (
+    Runs,
     SplineSplat,
     quadrature,
-    spline_matrix,
     spline_weights,
     spread,
 )
@@ -129,10 +129,13 @@ def test_splat_drops_what_leaves_the_window():
 def test_the_splat_as_a_matrix_is_the_splat():
     gen = torch.Generator().manual_seed(0)
     energy, time = torch.rand(2, 3, 4, generator=gen), 30 * torch.rand(2, 3, 4, generator=gen) - 5
-    albedo = torch.tensor([0.5, 0.0, 2.0])
+    albedo = torch.tensor([0.5, 0.0, 2.0], requires_grad=True)
     expected = SplineSplat.apply((energy * albedo[:, None]).flatten(1), time.flatten(1), 20)
-    found = spline_matrix(energy, time, 20).T @ albedo.repeat(2).numpy()
-    assert torch.from_numpy(found).view(2, 20) == pytest.approx(expected, abs=1e-6)
+    runs = Runs.of(energy, time, 20)
+    assert runs.send(albedo) == pytest.approx(expected.detach(), abs=1e-6)
+    grad = torch.rand(2, 20, generator=gen)
+    (by_paths,) = torch.autograd.grad((expected * grad).sum(), albedo)
+    assert torch.from_numpy(runs.pull(grad)) == pytest.approx(by_paths, rel=1e-5)
 
 
 def test_legs_keep_their_digits_far_from_the_origin():
@@ -390,9 +393,9 @@ def test_surfels_are_drawn_by_points_half_a_bin_apart(monkeypatch, bins, drawn):
     capture = wall([[0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     model, given = build(capture, [[0.0, 0.0, 0.5]], cell=bins * capture.bin_length), []
 
-    def watched(*args) -> torch.Tensor:
+    def watched(*args, **options) -> torch.Tensor:
         given.append(args[-1])
-        return who_hides(*args)
+        return who_hides(*args, **options)
 
     monkeypatch.setattr("nlos_lit.surfels.model.who_hides", watched)
     model.update_hiders()

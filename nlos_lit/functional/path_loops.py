@@ -1,0 +1,247 @@
+"""Loops over light paths: what :mod:`~nlos_lit.functional.surfel_paths` says, and the response of
+:mod:`~nlos_lit.functional.irf`. Arrays of points have a row for each coordinate.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from nlos_lit.functional.compiled import inlined, loop
+
+EDGE = 4  # bins on either side of a record that take what is lost
+ROW = 2 * EDGE + 3  # bins that a padded row has beside the record's
+BLOCK = 8  # bins at a time
+ZERO, ONE, TWO, THREE, FOUR, SIX, HALF = (np.float32(x) for x in (0, 1, 2, 3, 4, 6, 0.5))
+LEAST = np.float32(1e-12)  # m², of a leg's square
+
+
+@inlined
+def _leg(dx, dy, dz, fx, fy, fz, nx, ny, nz):
+    """Of a way from the wall: its square, and its ends' distances from the other's plane."""
+    square = max(dx * dx + dy * dy + dz * dz, LEAST)
+    at_wall = max(nx * dx + ny * dy + nz * dz, ZERO)
+    plane = max(-(fx * dx + fy * dy + fz * dz), ZERO)
+    return square, at_wall, plane
+
+
+@loop
+def legs(wall, normal, factor, way, cosine, p, f):
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel ``[B, N]`` of legs from wall points to points.
+
+    Wall points and their normals ``[B, 3]``, places and normals of points ``[3, N]``.
+    """
+    for b in range(len(wall)):
+        wx, wy, wz = wall[b]
+        nx, ny, nz = normal[b]
+        factors, ways, cosines = factor[b], way[b], cosine[b]
+        for n in range(p.shape[1]):
+            dx, dy, dz = p[0, n] - wx, p[1, n] - wy, p[2, n] - wz
+            square, at_wall, plane = _leg(dx, dy, dz, f[0, n], f[1, n], f[2, n], nx, ny, nz)
+            inverse, root = ONE / square, np.sqrt(square)
+            factors[n] = at_wall * plane * inverse * inverse
+            ways[n] = root
+            cosines[n] = plane * root * inverse
+
+
+@loop
+def pull_legs(wall, normal, of_factor, of_way, of_cosine, p, f, of_p, of_f):
+    """Add the gradients of places and normals that come by those of :func:`legs`."""
+    for b in range(len(wall)):
+        wx, wy, wz = wall[b]
+        nx, ny, nz = normal[b]
+        factors, ways, cosines = of_factor[b], of_way[b], of_cosine[b]
+        for n in range(p.shape[1]):
+            dx, dy, dz = p[0, n] - wx, p[1, n] - wy, p[2, n] - wz
+            fx, fy, fz = f[0, n], f[1, n], f[2, n]
+            square, at_wall, plane = _leg(dx, dy, dz, fx, fy, fz, nx, ny, nz)
+            inverse = ONE / square
+            root = np.sqrt(square) * inverse
+            g, c = factors[n] * inverse * inverse, cosines[n]
+            along = root * (ways[n] - c * plane * inverse) - FOUR * g * at_wall * plane * inverse
+            out = g * plane if at_wall > ZERO else ZERO
+            level = g * at_wall + c * root if plane > ZERO else ZERO
+            of_p[0, n] += along * dx + out * nx - level * fx
+            of_p[1, n] += along * dy + out * ny - level * fy
+            of_p[2, n] += along * dz + out * nz - level * fz
+            of_f[0, n] -= level * dx
+            of_f[1, n] -= level * dy
+            of_f[2, n] -= level * dz
+
+
+@loop
+def energies(seen, factor, factor2, energy, share):
+    """What paths carry ``[B, N]``: areas of points ``[N]`` times what is seen of their surfels ``[B, M]``
+    times the factors ``[B, N]`` of both legs.
+    """
+    each = len(share) // seen.shape[1]
+    sight = np.empty(len(share), np.float32)
+    for b in range(len(seen)):
+        for m in range(seen.shape[1]):
+            for n in range(m * each, (m + 1) * each):
+                sight[n] = seen[b, m]
+        first, second, row = factor[b], factor2[b], energy[b]
+        for n in range(len(share)):
+            row[n] = share[n] * sight[n] * first[n] * second[n]
+
+
+@loop
+def pull_energies(seen, factor, factor2, of_energy, of_seen, of_factor, of_factor2, share, of_share):
+    """Gradients of what :func:`energies` takes; adds to that of the areas, and sets the others."""
+    each = len(share) // seen.shape[1]
+    sight, part = np.empty(len(share), np.float32), np.empty(len(share), np.float32)
+    for b in range(len(seen)):
+        for m in range(seen.shape[1]):
+            for n in range(m * each, (m + 1) * each):
+                sight[n] = seen[b, m]
+        first, second, row = factor[b], factor2[b], of_energy[b]
+        to_first, to_second = of_factor[b], of_factor2[b]
+        for n in range(len(share)):
+            g = row[n] * share[n]
+            both = first[n] * second[n]
+            part[n] = g * both
+            of_share[n] += row[n] * sight[n] * both
+            to_first[n] = g * sight[n] * second[n]
+            to_second[n] = g * sight[n] * first[n]
+        for m in range(seen.shape[1]):
+            total = ZERO
+            for n in range(m * each, (m + 1) * each):
+                total += part[n]
+            of_seen[b, m] = total
+
+
+@inlined
+def _place(time, bins):
+    """First of four bins in a padded row, and the phase; what is no number is lost before the record."""
+    since = time - HALF if time > -TWO else -TWO - HALF
+    since = since if since < bins + THREE * HALF else bins + THREE * HALF
+    whole = np.floor(since)
+    return np.int64(whole) + EDGE - 1, since - whole
+
+
+@loop
+def splat(light, time, padded):
+    """Add light ``[B, K]`` that arrives at times ``[B, K]`` (bins) to padded rows ``[B, T + ROW]``."""
+    bins = np.float32(padded.shape[1] - ROW)
+    for b in range(len(light)):
+        row = padded[b]
+        for k in range(light.shape[1]):
+            i, s = _place(time[b, k], bins)
+            v, left = light[b, k] / SIX, ONE - s
+            row[i] += v * left * left * left
+            row[i + 1] += v * (FOUR + s * s * (THREE * s - SIX))
+            row[i + 2] += v * (ONE + THREE * s * (ONE + s - s * s))
+            row[i + 3] += v * s * s * s
+
+
+@loop
+def spline_values(padded, time, value, slope):
+    """What arrivals ``[B, K]`` see of padded rows ``[B, T + ROW]``, and its derivative by time."""
+    bins = np.float32(padded.shape[1] - ROW)
+    for b in range(len(time)):
+        row = padded[b]
+        for k in range(time.shape[1]):
+            i, s = _place(time[b, k], bins)
+            r0, r1, r2, r3 = row[i], row[i + 1], row[i + 2], row[i + 3]
+            c0, c1 = (r0 + FOUR * r1 + r2) / SIX, (r2 - r0) * HALF
+            c2, c3 = (r0 + r2) * HALF - r1, (r3 - r0) / SIX + (r1 - r2) * HALF
+            value[b, k] = c0 + s * (c1 + s * (c2 + s * c3))
+            slope[b, k] = c1 + s * (TWO * c2 + THREE * s * c3)
+
+
+@loop
+def runs(light, time, bins):
+    """What the light of sources does to bins: of each source at each spot a run of bins, and its shares.
+
+    ``light`` and ``time`` (bins) ``[B, M, Q]`` of Q points of each of M sources, per unit of the source's
+    light. Begins, in padded rows, and the first ``BLOCK`` of shares ``[B, M + 1]``, and all shares ``[n,
+    BLOCK]``.
+    """
+    spots, sources, points = time.shape
+    begin, block = np.empty((spots, sources), np.int32), np.zeros((spots, sources + 1), np.int64)
+    for b in range(spots):
+        if b:
+            block[b, 0] = block[b - 1, sources]
+        for m in range(sources):
+            first, last = bins + ROW, 0
+            for q in range(points):
+                i, _ = _place(time[b, m, q], bins)
+                first, last = min(first, i), max(last, i + 4)
+            begin[b, m] = first
+            block[b, m + 1] = block[b, m] + (last - first + BLOCK - 1) // BLOCK
+    share = np.zeros((block[spots - 1, sources], BLOCK), np.float32)
+    flat = share.reshape(-1)
+    for b in range(spots):
+        for m in range(sources):
+            at = block[b, m] * BLOCK - begin[b, m]
+            for q in range(points):
+                i, s = _place(time[b, m, q], bins)
+                v, left = light[b, m, q] / SIX, ONE - s
+                flat[at + i] += v * left * left * left
+                flat[at + i + 1] += v * (FOUR + s * s * (THREE * s - SIX))
+                flat[at + i + 2] += v * (ONE + THREE * s * (ONE + s - s * s))
+                flat[at + i + 3] += v * s * s * s
+    return begin, block, share
+
+
+@loop
+def send(begin, block, share, light, padded):
+    """Add the light ``[M]`` of sources to rows ``[B, T + ROW + BLOCK]``, by their :func:`runs`."""
+    for b in range(len(begin)):
+        row = padded[b]
+        for m in range(len(light)):
+            first, value = begin[b, m], light[m]
+            for n in range(block[b, m], block[b, m + 1]):
+                for k in range(BLOCK):
+                    row[first + k] += value * share[n, k]
+                first += BLOCK
+
+
+@loop
+def pull_send(begin, block, share, padded, of_light):
+    """Add to the gradient ``[M]`` of what :func:`send` sends."""
+    for b in range(len(begin)):
+        row = padded[b]
+        for m in range(len(of_light)):
+            first, total = begin[b, m], ZERO
+            for n in range(block[b, m], block[b, m + 1]):
+                for k in range(BLOCK):
+                    total += row[first + k] * share[n, k]
+                first += BLOCK
+            of_light[m] += total
+
+
+@loop
+def emg(number, first, sigma, kappa):
+    """``[3, number]`` distribution function F of an exponentially modified Gaussian at steps of 1 from
+    ``first`` on, and its slopes by σ and by κ.
+
+    With φ the normal density, Φ its integral and E = Φ(t/σ) - F, ∂F/∂σ = κ (φ(t/σ) - κσE) and ∂F/∂κ =
+    (t - κσ²) E + σ φ(t/σ).
+    """
+    found = np.empty((3, number))
+    for n in range(number):
+        t = first + n
+        u, late = t / sigma, t / sigma - kappa * sigma
+        half = 0.5 * np.exp(-0.5 * u * u)
+        jitter = half * _erfcx(-u * np.sqrt(0.5)) if u < 0 else 1 - 0.5 * math.erfc(u * np.sqrt(0.5))
+        if late < 0:
+            decay = half * _erfcx(-late * np.sqrt(0.5))
+        else:
+            decay = np.exp(0.5 * (kappa * sigma) ** 2 - kappa * t) * (
+                1 - 0.5 * math.erfc(late * np.sqrt(0.5))
+            )
+        density = half * np.sqrt(2 / np.pi)
+        found[0, n] = min(max(jitter - decay, 0.0), 1.0)
+        found[1, n] = kappa * (density - kappa * sigma * decay)
+        found[2, n] = (t - kappa * sigma**2) * decay + sigma * density
+    return found
+
+
+@inlined
+def _erfcx(x):
+    """exp(x²) erfc(x) of x ≥ 0; its asymptotic series, where erfc is nothing."""
+    if x < 25:
+        return np.exp(x * x) * math.erfc(x)
+    return (1 - 0.5 / x**2 + 0.75 / x**4) / (x * np.sqrt(np.pi))
