@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from blind_elements import Axis
 from blind_scenes import FINE, PAD, Scene
 from scipy.signal import fftconvolve
 
@@ -89,14 +90,16 @@ class Work:
         return counts
 
 
-def moved_in_time(light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: float) -> np.ndarray:
+def moved_in_time(
+    light: np.ndarray, scene: Scene, delay: np.ndarray, stretch: float, axis: Axis | None = None
+) -> np.ndarray:
     """Light ``[S, n]`` at path L brought to L + delay + stretch·(L - middle).
 
-    The cumulative light is interpolated linearly.
+    The cumulative light is interpolated linearly. The axis is the window's fine one where none is given.
     """
     if not delay.any() and stretch == 0:
         return light
-    edges, middle = scene.window.fine.edges, scene.window.middle
+    edges, middle = (axis or scene.window.fine).edges, scene.window.middle
     total = np.concatenate([np.zeros((len(light), 1)), np.cumsum(light, axis=1)], axis=1)
     came = edges + stretch * (edges - middle)
     return np.stack(

@@ -20,7 +20,15 @@ from conftest import ROOT
 from scipy.special import ndtr
 from wild_counting import photon_by_photon, recorded
 from wild_scenes import FAMILIES, OWN, WildScene, load
-from wild_statistic import nuisances, profiled, rendering, statistic, true_statistics
+from wild_statistic import (
+    WHOLE,
+    moved_scene,
+    nuisances,
+    profiled,
+    rendering,
+    statistic,
+    true_statistics,
+)
 from wild_table import ALL, BLOCK, LENGTH, MASTER_SEEDS, Spec, _block, seed_of, spec_of, table
 from wild_truth import hide, make, scan_order, write
 from wild_unknown import UNKNOWN
@@ -178,6 +186,10 @@ def test_geometry_by_hand():
     values = inject.wall_scaled(work, 0.1)
     true = np.stack([x * (1 + values["scale_x"]), y * (1 + values["scale_y"]), 0 * x], axis=1)
     np.testing.assert_allclose(path_of(work), 2 * np.linalg.norm(true - DOT, axis=1), atol=0.001)
+    np.testing.assert_allclose(work.arrival(DOT[None])[:, 0], path_of(work), atol=0.001)
+    work = work_on(scene)
+    inject.baseline_skewed(work, 0.1)
+    np.testing.assert_allclose(work.arrival(DOT[None])[:, 0], path_of(work), atol=0.001)
     work = work_on(scene)
     inject.baseline_skewed(work, 0.0)
     np.testing.assert_allclose(path_of(work), plain, atol=0.001)
@@ -205,6 +217,11 @@ def test_delays_by_hand():
             assert work.delay.mean() == pytest.approx(0, abs=1e-12)
             step = np.abs(np.diff(work.delay[work.turn])).max()
             assert step < 0.35 * 0.016
+    work = work_on(dot())
+    late = inject.time_offset(work, 2.0)["offset"] + inject.clock_scale(work, 0.1)["scale"] * (
+        path_of(work) - work.scene.window.middle
+    )
+    np.testing.assert_allclose(work.arrival(DOT[None])[:, 0], path_of(work) + late, atol=0.001)
     work = work_on(dot())
     inject.jitter_heavy(work, 0.5)
     assert work.delay.std() == pytest.approx(0.004, rel=0.35)
@@ -330,7 +347,7 @@ def test_a_scene_takes_up_an_offset_but_no_jitter():
         shown[name] = true_statistics(truth)[name]
     assert 0 < shown["time_offset"].projected < 0.1 * shown["time_offset"].plain
     assert shown["jitter_heavy"].projected > 0.5 * shown["jitter_heavy"].plain
-    basis = nuisances(truth)
+    basis = nuisances(truth, "jitter_heavy")
     number = (len(basis) - 5) // 6
     albedo = basis[:number].sum(axis=0)
     signal = truth.without - truth.dark
@@ -346,18 +363,60 @@ def test_a_scene_that_lies_aside_takes_up_a_wrong_baseline():
     assert again.projected < 0.5 * at_once.projected
 
 
+@pytest.mark.parametrize("name", ["time_offset", "clock_scale"])
+def test_a_scene_takes_up_what_moves_light_far(name):
+    """By five bins or so: to the plates' own light no slope leads, to those of a moved scene it does."""
+    truth = hide(Spec("plates", effects=(name,), strengths=(2,), level=2000, seed=6, side=SIDE))
+    at_once, again = (true_statistics(truth, steps)[name] for steps in (0, 8))
+    assert at_once.projected > 0.1 * at_once.plain
+    assert again.projected < 0.05 * at_once.projected
+
+
+def test_a_scene_moves_by_half_a_baseline():
+    truth = hide(Spec("letters", effects=("baseline_skewed",), strengths=(2,), level=2000, seed=6, side=SIDE))
+    change = moved_scene(truth, "baseline_skewed", len(nuisances(truth, "baseline_skewed")))
+    aside = change[-5:-2] * WHOLE * truth.scene.window.bin_length / 2
+    values = truth.values["baseline_skewed"]
+    half = -np.array([values["baseline_x"], values["baseline_y"], 0]) / 2
+    np.testing.assert_allclose(aside, half, atol=0.1 * np.linalg.norm(half))
+    statistics = true_statistics(truth)["baseline_skewed"]
+    assert statistics.projected < 1e-3 * statistics.plain
+
+
+@pytest.mark.parametrize("name", ["wall_scratches", "jitter_heavy"])
+def test_no_scene_takes_up_what_single_spots_have(name):
+    truth = hide(Spec("plates", effects=(name,), strengths=(2,), level=2000, seed=6, side=SIDE))
+    at_once, again = (true_statistics(truth, steps)[name] for steps in (0, 8))
+    assert 0.95 * at_once.projected < again.projected <= at_once.projected
+
+
+def test_the_steps_see_the_scene_as_the_other_injection_lets_it_be_seen():
+    effects = ("baseline_skewed", "wall_scratches")
+    truth = hide(Spec("letters", effects=effects, strengths=(2, 1), level=2000, seed=6, side=SIDE))
+    for name in effects:
+        none = rendering(truth, name, np.zeros(len(nuisances(truth, name))))
+        np.testing.assert_allclose(none, truth.lacking[name], rtol=1e-9)
+    albedo = nuisances(truth, "wall_scratches")[:96].sum(axis=0)
+    signal = truth.lacking["wall_scratches"] - truth.dark
+    assert np.corrcoef(albedo.ravel(), signal.ravel())[0, 1] > 0.99
+
+
 def test_moves_of_patches_are_those_of_a_scene_seen_anew():
     """By about a bin, of a patch or of the whole scene along each axis, or leaning: by the derivative, and
     rendered.
     """
     truth = hide(Spec("letters", effects=("jitter_heavy",), strengths=(0,), level=2000, seed=6, side=SIDE))
-    basis = nuisances(truth)
+    basis = nuisances(truth, "jitter_heavy")
     number = (len(basis) - 5) // 6
+
+    def seen(change: np.ndarray) -> np.ndarray:
+        return rendering(truth, "jitter_heavy", change) / (2 * np.abs(change).max())
+
     one, whole = number * np.arange(1, 6) + 3, 6 * number + np.arange(3)
     for k in (*one, *whole):
         change, step = np.zeros(len(basis)), 0.3 if k < 6 * number else 0.03
         change[k] = step
-        moved = (rendering(truth, change) - rendering(truth, -change)) / (2 * step)
+        moved = seen(change) - seen(-change)
         assert np.corrcoef(moved.ravel(), basis[k].ravel())[0, 1] > 0.96, k
         assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(basis[k]), rel=0.08), k
 

@@ -321,7 +321,7 @@ def wall_tilt_bow(work: WildWork, angle: float) -> Values:
         lifted[:, 2] = flat @ tilt + bow * angle * ((flat**2).sum(axis=1) - half**2 / 2) / half
         return lifted
 
-    work.light = work.scene.rendered(wall=bent)
+    work.place_wall(bent)
     return {"tilt_x": float(tilt[0]), "tilt_y": float(tilt[1])}
 
 
@@ -329,7 +329,7 @@ def wall_scaled(work: WildWork, scale: float) -> Values:
     """Mirrors whose gains are off: x and y are not what the file says, by unlike factors."""
     off = scale * np.array([1.0, work.rng.uniform(0, 0.8)]) * work.rng.choice([-1, 1])
     off = off[work.rng.permutation(2)]
-    work.light = work.scene.rendered(wall=lambda points: points * [1 + off[0], 1 + off[1], 1])
+    work.place_wall(lambda points: points * [1 + off[0], 1 + off[1], 1])
     return {"scale_x": float(off[0]), "scale_y": float(off[1])}
 
 
@@ -338,7 +338,7 @@ def baseline_skewed(work: WildWork, length: float) -> Values:
     towards, skew = work.rng.uniform(0, 2 * np.pi), work.rng.uniform(-0.25, 0.25, 2)
     baseline = length * np.array([np.cos(towards), np.sin(towards)])
     offset = baseline * (1 + work.scene.places @ skew)[:, None]
-    work.light = work.scene.apart(work.scene.laser + np.pad(offset, ((0, 0), (0, 1))))
+    work.look_aside(work.scene.laser + np.pad(offset, ((0, 0), (0, 1))))
     return {"baseline_x": float(baseline[0]), "baseline_y": float(baseline[1])}
 
 

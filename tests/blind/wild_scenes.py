@@ -50,7 +50,7 @@ class WildScene(Scene):
 
     Args:
         size: of elements, m.
-        proxy: about where a render's surface is, all in view; nothing that is measured hangs on it.
+        proxy: about where a render's surface is, all ``seen``; nothing that is measured hangs on it.
     """
 
     size: float = 0.01
@@ -316,7 +316,8 @@ def _render(rng: np.random.Generator, confocal: bool, side: int) -> WildScene:
     clean = finer(light, capture.t_start, capture.bin_length, window.fine)
     centre, normal, *rest = _surface(RENDERS / f"{name.split('_')[0]}_gt.h5")
     proxy = Elements(_mirrored(centre, flip, swap), _mirrored(normal, flip, swap), *rest)
-    return WildScene("render", window, sensor if confocal else laser, sensor, clean, proxy=proxy)
+    laser, seen = sensor if confocal else laser, np.ones((len(sensor), len(proxy.area)), dtype=bool)
+    return WildScene("render", window, laser, sensor, clean, seen=seen, proxy=proxy)
 
 
 def _surface(path: Path) -> tuple[np.ndarray, ...]:

@@ -32,6 +32,7 @@ class Truth:
         expected: ``[S, T]`` counts without photon noise. without: the same without anything hidden.
         lacking: the same without one injection, the others in it.
         counts: ``[S, T]`` photons.
+        work: the measurement of ``expected``. works: those of ``lacking``.
         response: σ and 1/κ of the ordinary response, m. dark: ordinary background, counts a bin.
     """
 
@@ -48,6 +49,8 @@ class Truth:
     without: np.ndarray
     lacking: dict[str, np.ndarray]
     counts: np.ndarray
+    work: WildWork
+    works: dict[str, WildWork]
     response: tuple[float, float]
     dark: float
 
@@ -71,12 +74,7 @@ def hide(spec: Spec) -> Truth:
     whole, values = _measured(spec, names)
     expected = whole.expected()
     without = _measured(spec, ())[0].expected() if names else expected
-    lacking = {
-        name: without
-        if len(names) == 1
-        else _measured(spec, tuple(n for n in names if n != name))[0].expected()
-        for name in names
-    }
+    others = {name: _measured(spec, tuple(n for n in names if n != name))[0] for name in names}
     rng = np.random.default_rng([spec.seed, 1])
     counts = rng.poisson(expected) if whole.sampler is None else whole.sampler(rng)
     unknown = next((name for name in names if name in UNKNOWN), "")
@@ -92,8 +90,10 @@ def hide(spec: Spec) -> Truth:
         labels={name: STRENGTHS[spec.strengths[spec.effects.index(name)]] for name in names},
         expected=expected,
         without=without,
-        lacking=lacking,
+        lacking={name: work.expected() for name, work in others.items()},
         counts=counts,
+        work=whole,
+        works=others,
         response=(whole.sigma * whole.bin, whole.bin / whole.kappa),
         dark=whole.dark,
     )

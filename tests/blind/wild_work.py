@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from blind_elements import sight, third_bounce
 from blind_scenes import FINE, PAD
 from blind_work import Work, moved_in_time
 from scipy.signal import fftconvolve
@@ -25,6 +26,9 @@ class WildWork(Work):
         dim: ordinary background, counts a bin for each count of the scene a spot.
         sampler: draws ``[S, T]`` counts where they are no Poisson counts of the expected ones; of the last
             step of ``counting`` only.
+        laser, sensor: ``[S, 3]`` wall points that light really comes over, m. seen: ``[S, N]`` whether both
+            see an element.
+        plain: ``[S, n]`` light over them without weights on its paths.
     """
 
     scene: WildScene
@@ -32,9 +36,15 @@ class WildWork(Work):
     kappa: float = 0.6
     dim: float = 1e-4
     sampler: Sampler | None = None
+    laser: np.ndarray = field(init=False)
+    sensor: np.ndarray = field(init=False)
+    seen: np.ndarray = field(init=False)
+    plain: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.laser, self.sensor, self.seen = self.scene.laser, self.scene.sensor, self.scene.seen
+        self.plain = self.light
         self.background = np.full((len(self.gain), self.scene.window.n_bins), self.dark)
 
     @property
@@ -51,6 +61,26 @@ class WildWork(Work):
     def turn(self) -> np.ndarray:
         """``[S]`` spots in the order of acquisition."""
         return np.argsort(self.rank)
+
+    def place_wall(self, wall: Callable[[np.ndarray], np.ndarray]) -> None:
+        """Points ``[S, 3]`` of the file really are at ``wall`` of them."""
+        confocal = self.laser is self.sensor
+        self.sensor = wall(self.sensor)
+        self.laser = self.sensor if confocal else wall(self.laser)
+        self.light = self.plain = self.scene.rendered(wall=wall)
+
+    def look_aside(self, sensor: np.ndarray) -> None:
+        """The sensor looks at points ``[S, 3]`` of its own."""
+        scene = self.scene
+        self.sensor, self.seen = sensor, scene.seen & sight(scene.mesh, scene.elements, sensor)
+        self.light = third_bounce(scene.elements, scene.laser, sensor, self.seen, scene.window.fine)
+        self.plain = self.light
+
+    def arrival(self, points: np.ndarray) -> np.ndarray:
+        """``[S, N]`` path at which light from points ``[N, 3]`` comes, m."""
+        gaps = (np.linalg.norm(points - wall[:, None], axis=2) for wall in (self.laser, self.sensor))
+        path = sum(gaps)
+        return path + self.delay[:, None] + self.stretch * (path - self.scene.window.middle)
 
     def count(self, change: Callable[[np.ndarray], np.ndarray], sampler: Sampler | None = None) -> None:
         """One more step that acts on ``[S, T]`` counts."""
@@ -71,10 +101,14 @@ class WildWork(Work):
     def incident(self) -> np.ndarray:
         """``[S, T]`` counts before ``counting``."""
         signal = self.signal()
+        return signal * self.shares(signal)[:, None] + self.background
+
+    def shares(self, signal: np.ndarray) -> np.ndarray:
+        """``[S]`` factor by which gain changes the scene's counts ``[S, T]``."""
         # What changes the gain leaves the light of the whole scan as it is, so that the photon level is what
         # was asked for.
         each = signal.sum(axis=1)
-        return signal * (self.gain * (each.sum() / (each @ self.gain)))[:, None] + self.background
+        return self.gain * (each.sum() / (each @ self.gain))
 
     def expected(self) -> np.ndarray:
         """``[S, T]`` counts."""
