@@ -34,6 +34,7 @@ from nlos_lit.inference.members import (
     Trial,
     chosen,
     group_of,
+    unknown_beside,
     weighed,
 )
 from nlos_lit.inference.per_spot import solve
@@ -403,6 +404,32 @@ class Loop:
         text, kept = f"rebuilding the scene with {', '.join(names)}", f"built{self.number}_{'_'.join(names)}"
         return self.steps("fit", text, kept, partial(self._or_anew, self.only(coarse, names)))
 
+    def but_outdone(self, effects: Held, start: Held, asked: Sequence[Member]) -> Held | None:
+        """What is left without effects that are not surely asked for more than something unknown beside them.
+
+        Args:
+            effects: that hold.
+            start: what held before they came.
+            asked: all that was tried, free terms beside the effects.
+
+        Returns:
+            Those that are left, and scenes with them alone; None where that is all.
+        """
+        before = {m.name for m in start.members}
+        unknown = unknown_beside([m for m in asked if m.name not in before])
+        if not unknown:
+            return None
+        least = unknown + self.least
+        named = [m for m in effects.members if m.accepted and m.name not in before]
+        more = [m for m in named if m.confirmed is not None and m.confirmed.evidence > least]
+        if len(more) == len(named):
+            return None
+        if not more:
+            return start
+        staying = start.members + more
+        coarse = self.built_with(effects.coarse, [m.name for m in staying])
+        return Held(staying, self.better(self.fine(coarse, "with_those_that_do_more"), coarse), coarse)
+
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""
         names = [m.name for m in gone]
@@ -445,13 +472,13 @@ class Loop:
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
             free, per_spot = member.candidate.free, member.candidate.effect.per_spot
-            if now.holds(free) and not per_spot and not (free and now.much):
+            if now.holds(member.candidate) and not per_spot and not (free and now.much):
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
                 if not self._accounts(now.evidence, scene, fine):
                     evidence = self._beside(fine, member.name, kept)
                     now = replace(now, evidence=min(evidence, now.evidence))
-            found.append(replace(member, confirmed=now, accepted=now.holds(free)))
+            found.append(replace(member, confirmed=now, accepted=now.holds(member.candidate)))
         return found
 
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
@@ -511,10 +538,19 @@ class Loop:
             confirmed = Confirmed(evidence, needed, gain, weight, explained, shared)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
-            holds = confirmed.holds(member.candidate.free)
+            holds = confirmed.holds(member.candidate)
             asked = replace(member, confirmed=confirmed, accepted=holds, trials=trials)
             found.append((asked, fit))
-        return found, enough
+        unknown = unknown_beside([m for m, _ in found if m.accepted or not m.candidate.free])
+        return [(self._outdone(member, unknown), fit) for member, fit in found], enough
+
+    def _outdone(self, member: Member, unknown: float) -> Member:
+        """A member that was asked, where something unknown holds with so many nats: an effect needs more."""
+        old = member.confirmed
+        if member.candidate.free or old is None or not unknown:
+            return member
+        now = replace(old, needed=max(old.needed, unknown + self.least))
+        return replace(member, confirmed=now, accepted=now.holds(member.candidate))
 
     def _own(
         self, scene: SurfelFit, names: list[str], kept: str
@@ -742,22 +778,44 @@ def criticise(
         found.pools.append(loop.ask(coarse, s.most - len(found.members), effects))
         return found.pools[-1]
 
-    def held_by(new: list[Member]) -> tuple[list[Member], SurfelFit, SurfelFit]:
-        """Who of those that came holds beside what is held, and the fine and the parsimonious scene."""
+    pool = asked(effects=True)
+
+    def joined_by(new: list[Member], free: bool) -> list[Member]:
+        """Those that came, and effects or free terms that are asked for beside them, which come too."""
+        nonlocal coarse, pool
+        while come := loop.next(pool, free):
+            coarse = loop.joined(coarse, [m.candidate for m in come])
+            again = {m.name for m in come}
+            new, found.members = new + come, [m for m in found.members if m.name not in again] + come
+            told(first, coarse, found.members)
+            pool = asked(effects=not free)
+        return new
+
+    def with_those(new: list[Member], beside: Held) -> Held:
+        """What holds of those that came, beside what is held."""
+        if not new:
+            return beside
         grown = loop.better(loop.fine(coarse, "with_all"), coarse)
-        tried, scene, left = loop.hold(new, grown, coarse, held)
+        tried, scene, left = loop.hold(new, grown, coarse, beside)
         now = {m.name: m for m in tried}
         found.members = [now.get(m.name, m) for m in found.members]
-        return [m for m in tried if m.stays], scene, left or coarse
+        return Held(beside.members + [m for m in tried if m.stays], scene, left or coarse)
 
-    pool = asked(effects=True)
+    def with_free(beside: Held) -> Held:
+        """What holds when free terms are asked for, too."""
+        nonlocal coarse, pool
+        if beside.coarse is not coarse:
+            coarse = beside.coarse
+            pool = asked(effects=False)
+        return with_those(joined_by([], free=True), beside)
+
     if (leads := pool.foreign) is not None:
         before, found.members = pool, [Member(leads)]
         coarse = loop.joined(base, [leads])
         told(first, coarse, found.members)
         pool = asked(effects=True)
         rivals = [c for c in lost(before.candidates, pool.candidates, loop.least) if c.free]
-        held = Held(*held_by([Member(leads, rivals)]))
+        held = with_those([Member(leads, rivals)], held)
         if not held.members:
             held, coarse, pool, found.members = Held([], first, base), base, before, []
     start, new = held, list[Member]()
@@ -769,29 +827,22 @@ def criticise(
         new = [replace(m, rivals=rivals) for m in new]
         found.members = found.members + new
         told(first, coarse, found.members)
-    doubted: Held | None = None
-    for free in (False, True):
-        while come := loop.next(pool, free):
-            coarse = loop.joined(coarse, [m.candidate for m in come])
-            new, found.members = new + come, found.members + come
-            told(first, coarse, found.members)
-            pool = asked(effects=not free)
-        if new:
-            kept, scene, left = held_by(new)
-            held = Held(held.members + kept, scene, left)
-            if kept and not free and not loop.predicts(scene, start.scene):
-                doubted, held = held, start  # what something unknown does may stand for them
-        if held.coarse is not coarse and not free:
-            coarse = held.coarse
-            pool = asked(effects=False)
-        new = []
-    if doubted is not None and len(held.members) == len(start.members):
-        held = doubted
-    elif doubted is not None:
-        less = {m.name for m in doubted.members[len(start.members) :]}
-        found.members = [
-            replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members
-        ]
+    effects = with_those(joined_by(new, free=False), start)
+    fewer: Held | None = start  # what they do may be what something unknown does
+    if len(effects.members) > len(start.members) and not loop.predicts(effects.scene, start.scene):
+        held = effects
+    else:
+        held = with_free(effects)
+        fewer = loop.but_outdone(effects, start, found.members)
+    if fewer is not None:
+        known = found.members
+        other = with_free(fewer)
+        if len(other.members) > len(fewer.members):
+            less = {m.name for m in effects.members} - {m.name for m in fewer.members}
+            gone = [replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members]
+            held, found.members = other, gone
+        else:
+            found.members = known
     found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
         found.final = scene

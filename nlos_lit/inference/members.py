@@ -68,14 +68,17 @@ class Confirmed:
         """Spots that were not fitted are predicted much better with it."""
         return self.explained > MUCH and self.weight > SURE
 
-    def holds(self, free: bool) -> bool:
+    def holds(self, candidate: Candidate) -> bool:
         """By its own evidence, which other spots do not contradict.
 
         Args:
-            free: the term is one. A misfit of the scene may look like it as like any, but it is no name: what
-                it predicts is enough.
+            candidate: the term. An effect must predict others better than no effect. A free term is no name,
+                and a number for each spot says next to nothing of others: with those others must not surely
+                be predicted worse, and what a free term predicts is enough.
         """
-        return self.weight > EVEN and (self.evidence > self.needed or (free and self.much))
+        law = not candidate.free and not candidate.effect.per_spot
+        enough = self.evidence > self.needed or (candidate.free and self.much)
+        return enough and self.weight > (EVEN if law else 1 - SURE)
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,29 @@ class Findings:
     def present(self) -> list[Member]:
         """Terms that hold, and effects that the scenes keep besides."""
         return [m for m in self.members if m.stays]
+
+
+def unknown_beside(members: Sequence[Member]) -> float:
+    """How much is asked for that no effect does.
+
+    Args:
+        members: that were asked, effects without free terms, and free terms beside the effects.
+
+    Returns:
+        nats of the free term that has most, of those that have what they need; 0 where there is none. Those
+        are left out that go on with what a stronger effect does that holds: no cause follows an equation to
+        the last digit.
+    """
+    known = [(m, m.confirmed) for m in members if m.confirmed is not None]
+    effects = [(m.candidate.effect.followed_by, c.evidence) for m, c in known if m.accepted]
+    unknown = [
+        c.evidence
+        for m, c in known
+        if m.candidate.free
+        and c.evidence > c.needed
+        and not any(m.name in does and nats > c.evidence for does, nats in effects)
+    ]
+    return max(unknown, default=0.0)
 
 
 def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
