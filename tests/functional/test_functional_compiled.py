@@ -1,0 +1,240 @@
+"""Compiled loops say what is said tensor by tensor: values, gradients, and derivatives in forward mode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nlos_lit.functional import irf, surfel_graph, surfel_paths, surfel_visibility
+from nlos_lit.functional.compiled import in_threads, side_by_side
+from nlos_lit.functional.path_loops import ROW, spline_values
+from nlos_lit.functional.surfel_graph import (
+    albedo_cost,
+    bending,
+    carry_along,
+    lay_sheet,
+    level_of,
+    neighbour_pairs,
+    sheet_normals,
+)
+from nlos_lit.functional.surfel_paths import SplineSplat, patches, quadrature, spline_at, trace
+from nlos_lit.functional.surfel_visibility import who_hides
+
+pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+GEN = torch.Generator().manual_seed(3)
+CELL = torch.tensor([0.04, 0.05])
+
+
+def randn(*shape: int, scale: float = 1.0) -> Tensor:
+    return scale * torch.randn(*shape, generator=GEN)
+
+
+@pytest.fixture
+def plainly(monkeypatch):
+    """Runs a function with nothing compiled."""
+
+    def run(function, *args):
+        with monkeypatch.context() as patch:
+            for module in (surfel_paths, surfel_graph, surfel_visibility):
+                patch.setattr(module, "compiled", lambda values: False)
+            return function(*args)
+
+    return run
+
+
+def scene(number: int = 40) -> tuple[Tensor, Tensor, Tensor]:
+    """Centres and normals of surfels, some of them upright, and how they curve."""
+    centre = torch.stack(
+        [randn(number, scale=0.2), randn(number, scale=0.2), 1 + randn(number, scale=0.1)], 1
+    )
+    normal = normalize(randn(number, 3, scale=0.6) + torch.tensor([0.0, 0.0, -1.0]), dim=1)
+    bow = randn(number, 3, 3, scale=3.0)
+    return centre, normal, bow + bow.mT
+
+
+def with_gradients(function, *given: Tensor) -> list[Tensor]:
+    """What comes out, and the gradients of a random sum of it."""
+    given = [x.clone().requires_grad_() for x in given]
+    found = function(*given)
+    found = [found] if isinstance(found, Tensor) else list(found)
+    gen = torch.Generator().manual_seed(8)
+    total = sum((torch.randn(x.shape, generator=gen) * x).sum() for x in found)
+    return [x.detach() for x in found] + list(torch.autograd.grad(total, given))
+
+
+def alike(compiled: list[Tensor], plain: list[Tensor], rel: float = 1e-4) -> None:
+    assert len(compiled) == len(plain)
+    for one, other in zip(compiled, plain, strict=True):
+        assert one.shape == other.shape
+        assert (one - other).abs().max() <= rel * other.abs().max()
+    assert any(x.abs().max() > 0 for x in plain)
+
+
+@pytest.mark.parametrize("curved", [True, False])
+@pytest.mark.parametrize("points", [1, 2])
+def test_patches(plainly, curved, points):
+    _, normal, curvature = scene()
+
+    def found(normal: Tensor):
+        return patches(normal, CELL, quadrature(points), curvature if curved else None)
+
+    alike(with_gradients(found, normal), plainly(with_gradients, found, normal))
+    towards = randn(*normal.shape)
+    pushed = torch.func.jvp(found, (normal,), (towards,))[1]
+    alike(list(pushed), list(plainly(torch.func.jvp, found, (normal,), (towards,))[1]))
+
+
+@pytest.mark.parametrize("confocal", [True, False])
+def test_paths(plainly, confocal):
+    """Also of points whose light does not reach the wall: behind it, or turned away."""
+    centre, normal, curvature = scene()
+    centre[0, 2], normal[1] = -0.5, torch.tensor([0.0, 0.0, 1.0])
+    laser, sensor = (torch.cat([randn(5, 2, scale=0.4), torch.zeros(5, 1)], 1) for _ in range(2))
+    up, seen = torch.tensor([[0.0, 0.0, 1.0]] * 5), torch.rand(5, 40, generator=GEN)
+
+    def found(centre: Tensor, normal: Tensor, seen: Tensor) -> list[Tensor]:
+        walls = (laser, up, sensor, up)
+        return list(trace(centre, normal, CELL, quadrature(2), *walls, confocal, curvature, seen)[:6])
+
+    given = (centre, normal, seen)
+    alike(with_gradients(found, *given), plainly(with_gradients, found, *given))
+    towards = tuple(randn(*x.shape) for x in given)
+    alike(
+        list(torch.func.jvp(found, given, towards)[1]),
+        list(plainly(torch.func.jvp, found, given, towards)[1]),
+    )
+
+
+def test_splines(plainly):
+    """Also of what arrives before and after the record, and at its ends."""
+    time = torch.cat(
+        [60 * torch.rand(3, 200, generator=GEN) - 5, torch.tensor([[-2.0, 0.0, 50.0, 52.0]] * 3)], 1
+    )
+    light, image = torch.rand(3, 204, generator=GEN), randn(3, 50)
+
+    def splatted(light: Tensor, time: Tensor) -> Tensor:
+        return SplineSplat.apply(light, time, 50)
+
+    alike(with_gradients(splatted, light, time), plainly(with_gradients, splatted, light, time))
+    alike(list(spline_at(image, time)), list(plainly(spline_at, image, time)))
+
+
+def test_what_is_no_number_is_lost():
+    """It must not be written beside the record."""
+    time = torch.tensor([[float("nan"), float("inf"), -float("inf"), 3e38, 4.5]])
+    found = SplineSplat.apply(torch.tensor([[5.0, 5.0, 5.0, 5.0, 6.0]]), time, 8)
+    assert found[0].tolist() == pytest.approx([0, 0, 0, 1, 4, 1, 0, 0])
+
+
+def test_sheets(plainly):
+    centre, normal, _ = scene(200)
+    pairs = neighbour_pairs(centre, normal, 0.1)
+    weight = torch.rand(200, generator=GEN)
+    assert len(pairs[0]) > 400
+    for as_it_is in (False, True):
+        sheet = lay_sheet(centre, normal, weight, pairs, 0.05, as_it_is)
+
+        def normals(moved: Tensor, sheet=sheet) -> Tensor:
+            return sheet_normals(sheet, moved)
+
+        moved = centre + randn(200, 3, scale=0.01)
+        alike(with_gradients(normals, moved), plainly(with_gradients, normals, moved))
+        shift = randn(200)
+        alike(
+            with_gradients(lambda x, sheet=sheet: carry_along(sheet, x), shift),
+            plainly(with_gradients, lambda x, sheet=sheet: carry_along(sheet, x), shift),
+        )
+
+
+def test_costs(plainly):
+    centre, normal, _ = scene(200)
+    pairs, weight = neighbour_pairs(centre, normal, 0.1), torch.rand(200, generator=GEN)
+
+    def bends(centre: Tensor, normal: Tensor) -> Tensor:
+        return bending(centre, normal, weight, pairs)
+
+    alike(with_gradients(bends, centre, normal), plainly(with_gradients, bends, centre, normal))
+    albedo = torch.rand(200, generator=GEN) ** 3
+    albedo[3] = 0.0
+    level = level_of(albedo)
+    for weights in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.7, 1.3, 3.0)):
+
+        def costs(albedo: Tensor, weights=weights) -> Tensor:
+            return albedo_cost(albedo, pairs, level, *weights)
+
+        alike(with_gradients(costs, albedo), plainly(with_gradients, costs, albedo))
+
+
+def test_views(plainly):
+    """Of walls that are not flat, too; a pixel's edge may fall to either side."""
+    centre, normal, _ = scene(300)
+    wall = torch.cat([randn(30, 2, scale=0.4), torch.tensor([0.0, 0.02]).repeat(15)[:, None]], 1)
+    target = centre[:, None] + randn(300, 4, 3, scale=0.01)
+    given = (centre, normal, CELL, wall, target, 3)
+    found, plain = who_hides(*given), plainly(who_hides, *given)
+    assert (plain > 0).float().mean() > 0.1
+    assert (found != plain).float().mean() < 1e-3
+    names = torch.randperm(300, generator=GEN).to(torch.int32) + 7
+    named = who_hides(*given, names=names)
+    assert torch.equal(named, torch.where(found > 0, names[(found - 1).clamp_min(0).long()], 0))
+
+
+@pytest.mark.parametrize(("sigma", "kappa"), [(0.6, 2.0), (3.0, 0.2), (1e-2, 1.0), (8.0, 5.0), (0.3, 50.0)])
+def test_response_and_its_slopes(sigma, kappa):
+    """By differences of the distribution function, and by its derivatives tensor by tensor."""
+
+    def plain(sigma: Tensor, kappa: Tensor) -> Tensor:
+        edges = torch.arange(91, dtype=torch.float64) - 20.5
+        return torch.diff(irf.emg_cdf(edges, sigma.double(), kappa.double())).float()
+
+    def found(sigma: Tensor, kappa: Tensor) -> Tensor:
+        return irf.response(sigma, kappa, 90, 20)
+
+    given = (torch.tensor(sigma), torch.tensor(kappa))
+    alike(with_gradients(found, *given)[:1], with_gradients(plain, *given)[:1], rel=1e-6)
+    towards = (torch.tensor(0.7), torch.tensor(-0.2))
+    slopes = [torch.func.jvp(f, given, towards)[1] for f in (found, plain)]
+    assert slopes[0] == pytest.approx(slopes[1], abs=1e-6)
+    gen = torch.Generator().manual_seed(1)
+    weight = torch.rand(90, generator=gen)
+    pulls = []
+    for function in (found, plain):
+        leaves = [x.clone().requires_grad_() for x in given]
+        pulls.append(torch.stack(torch.autograd.grad((weight * function(*leaves)).sum(), leaves)))
+    assert pulls[0] == pytest.approx(pulls[1], abs=1e-6)
+
+
+def test_threads_divide_rows_and_add_their_sums(monkeypatch):
+    """Rows go to as many threads as torch may have, if there is work enough for them."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    seen, given, total = [], np.arange(10.0)[:, None], np.zeros(1)
+
+    def loop(rows: np.ndarray, factor: float, total: np.ndarray) -> None:
+        seen.append(len(rows))
+        total += factor * rows.sum()
+
+    for work, parts in ((1 << 20, [3, 3, 4]), (100, [10])):
+        seen.clear()
+        total[:] = 0
+        in_threads(loop, work, [given], [2.0], [total])
+        assert (sorted(seen), total.item()) == (parts, 90.0)
+
+
+def test_side_by_side_keeps_the_order(monkeypatch):
+    """Each thread has torch for itself; the caller keeps its own."""
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
+    assert side_by_side(lambda a, b: a - b, [5, 6, 7], [1, 2, 3]) == [4, 4, 4]
+
+
+def test_threads_change_no_path(monkeypatch):
+    time, image = 40 * torch.rand(64, 2000, generator=GEN), randn(64, 40 + ROW).numpy()
+    found = []
+    for threads in (1, 2):
+        monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
+        value, slope = (np.empty((64, 2000), np.float32) for _ in range(2))
+        in_threads(spline_values, time.numel(), [image, time.numpy(), value, slope])
+        found.append((value, slope))
+    assert all(np.array_equal(*pair) for pair in zip(*found, strict=True))
