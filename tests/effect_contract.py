@@ -21,6 +21,7 @@ from nlos_lit.effects.hooks import HOOKS
 from nlos_lit.effects.nominal import numbers_of
 from nlos_lit.effects.page import sections
 from nlos_lit.effects.strengths import effects_at
+from nlos_lit.functional.compiled import tensor_by_tensor
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
@@ -242,7 +243,8 @@ class EffectContract:
             (gradient,) = torch.autograd.grad((rendered(self.spots) * weights).sum(), value)
             backward = float((gradient * direction).sum())
             zero, one = torch.zeros((), dtype=torch.float64), torch.ones((), dtype=torch.float64)
-            forward = torch.func.jvp(along, (zero,), (one,))[1].detach()
+            with tensor_by_tensor():
+                forward = torch.func.jvp(along, (zero,), (one,))[1].detach()
             with torch.no_grad():
                 difference = (along(zero + 2e-3) - along(zero - 2e-3)) / 4e-3
             size = float(difference.abs().max())

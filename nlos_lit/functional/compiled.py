@@ -2,13 +2,15 @@
 
 Tensor by tensor each operation passes once through memory, and small scenes wait for the calls. A compiled
 loop keeps what it works on in registers. It takes contiguous arrays of single precision. On other devices,
-and for derivatives in forward mode, the same is said tensor by tensor beside it.
+and within :func:`tensor_by_tensor`, the same is said by operations of torch beside it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from typing import Any, TypeVar
 
@@ -18,6 +20,7 @@ from numba import njit
 from torch import Tensor
 
 Of = TypeVar("Of")  # what is found
+_plainly = ContextVar("plainly", default=False)
 WORTH = 1 << 16  # steps of a loop from which on a second thread is asked
 # Sums in any order; what is no number stays none.
 LOOSE = {"reassoc", "contract", "arcp", "nsz"}
@@ -48,9 +51,24 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(inline="always")(function)
 
 
-def compiled(values: Tensor) -> bool:
-    """Whether loops over such values are compiled: single precision on the CPU."""
+def for_loops(values: Tensor) -> bool:
+    """Loops take such values: single precision on the CPU."""
     return values.device.type == "cpu" and values.dtype == torch.float32
+
+
+def compiled(values: Tensor) -> bool:
+    """Functions of such values whose gradients are loops, too, are compiled."""
+    return for_loops(values) and not _plainly.get()
+
+
+@contextmanager
+def tensor_by_tensor() -> Iterator[None]:
+    """Within it torch sees every operation, as it must for derivatives in forward mode."""
+    token = _plainly.set(True)
+    try:
+        yield
+    finally:
+        _plainly.reset(token)
 
 
 def numpy_of(values: Tensor) -> np.ndarray:

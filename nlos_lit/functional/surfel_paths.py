@@ -11,15 +11,14 @@ curved patch vary smoothly over it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from nlos_lit.functional import path_loops, sheet_loops
-from nlos_lit.functional.compiled import compiled, in_threads, numpy_of
+from nlos_lit.functional.compiled import compiled, for_loops, in_threads, numpy_of
 from nlos_lit.functional.path_loops import EDGE
 
 STEEP = 0.4  # cosine of the tilt up to which a patch covers its whole lateral cell
@@ -211,44 +210,21 @@ def _patches(
     return shift, facing, share
 
 
-class _Loop(torch.autograd.Function):
-    """What a compiled loop works out; its forward derivative is that of the same tensor by tensor."""
-
-    plain: ClassVar[Callable[..., Any]]
+class _Patches(torch.autograd.Function):
+    """Compiled."""
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Any) -> None:
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @classmethod
-    def pushed(cls, ctx: Any, changes: tuple[Tensor | None, ...]) -> Any:
-        given = ctx.saved_tensors
-        towards = tuple(torch.zeros_like(x) if c is None else c for x, c in zip(given, changes, strict=True))
-        return torch.func.jvp(cls.plain, given, towards)[1]
-
-
-class _Patches(_Loop):
-    plain = staticmethod(_patches)
-
-    @staticmethod
-    def forward(normal: Tensor, cell: Tensor, offsets: Tensor, curvature: Tensor) -> tuple[Tensor, ...]:
-        shape = (len(normal), len(offsets))
-        place, facing, share = (normal.new_empty(*shape, *more) for more in ((3,), (3,), ()))
-        given = [numpy_of(x) for x in (normal, curvature, cell, offsets)]
-        sheet_loops.patches(*given, np.float32(STEEP), place.numpy(), facing.numpy(), share.numpy())
+    def forward(
+        ctx: Any, normal: Tensor, cell: Tensor, offsets: Tensor, curvature: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        place, facing, share = (normal.new_empty(len(normal), len(offsets), *n) for n in ((3,), (3,), ()))
+        ctx.given = [*map(numpy_of, (normal, curvature, cell, offsets)), np.float32(STEEP)]
+        sheet_loops.patches(*ctx.given, place.numpy(), facing.numpy(), share.numpy())
         return place, facing, share
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        normal, cell, offsets, curvature = ctx.saved_tensors
-        given = [numpy_of(x) for x in (normal, curvature, cell, offsets)]
-        found = sheet_loops.pull_patches(*given, np.float32(STEEP), *(numpy_of(g) for g in grads))
-        return torch.from_numpy(found), None, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
-        return _Patches.pushed(ctx, changes)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None, None, None]:
+        return torch.from_numpy(sheet_loops.pull_patches(*ctx.given, *map(numpy_of, grads))), None, None, None
 
 
 def _legs(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -277,29 +253,25 @@ def _plain_legs(
     return at_wall * plane / square**2, distance, plane / distance
 
 
-class _Legs(_Loop):
-    plain = staticmethod(_plain_legs)
+class _Legs(torch.autograd.Function):
+    """Compiled."""
 
     @staticmethod
-    def forward(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, ...]:
-        found = points.new_empty(3, len(wall), *points.shape[:2])
-        rows = [numpy_of(x) for x in (wall, normal, *found.flatten(2))]
-        in_threads(path_loops.legs, found[0].numel(), rows, [_rows(points), _rows(facing)])
-        return tuple(found)
+    def forward(
+        ctx: Any, points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        factor, leg, cosine = found = points.new_empty(3, len(wall), *points.shape[:2])
+        ctx.walls, ctx.points = [numpy_of(wall), numpy_of(normal)], [_rows(points), _rows(facing)]
+        in_threads(path_loops.legs, leg.numel(), [*ctx.walls, *found.flatten(2).numpy()], ctx.points)
+        return factor, leg, cosine
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        points, facing, wall, normal = ctx.saved_tensors
-        found = points.new_zeros(2, 3, points.shape[:2].numel())
-        rows = [numpy_of(x) for x in (wall, normal, *(g.flatten(1) for g in grads))]
-        fixed, sums = [_rows(points), _rows(facing)], list(found.numpy())
-        in_threads(path_loops.pull_legs, grads[0].numel(), rows, fixed, sums)
-        of_points, of_facing = (x.T.reshape(points.shape) for x in found)
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        found = np.zeros((2, *ctx.points[0].shape), np.float32)
+        rows = [*ctx.walls, *(numpy_of(g.flatten(1)) for g in grads)]
+        in_threads(path_loops.pull_legs, grads[0].numel(), rows, ctx.points, list(found))
+        of_points, of_facing = (torch.from_numpy(x).T.reshape(*grads[0].shape[1:], 3) for x in found)
         return of_points, of_facing, None, None
-
-    @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
-        return _Legs.pushed(ctx, changes)
 
 
 def _energies(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
@@ -313,28 +285,30 @@ def _plain_energies(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) 
     return share * seen[:, :, None] * factor * other
 
 
-class _Energies(_Loop):
-    plain = staticmethod(_plain_energies)
+class _Energies(torch.autograd.Function):
+    """Compiled."""
 
     @staticmethod
-    def forward(share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
+    def forward(ctx: Any, share: Tensor, seen: Tensor, factor: Tensor, other: Tensor) -> Tensor:
         energy = torch.empty_like(factor)
-        rows = [numpy_of(x) for x in (seen, *(x.flatten(1) for x in (factor, other, energy)))]
-        in_threads(path_loops.energies, energy.numel(), rows, [numpy_of(share.flatten())])
+        ctx.rows = [numpy_of(x) for x in (seen, factor.flatten(1), other.flatten(1))]
+        ctx.share = numpy_of(share.flatten())
+        in_threads(path_loops.energies, energy.numel(), [*ctx.rows, energy.flatten(1).numpy()], [ctx.share])
         return energy
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
-        share, seen, factor, other = ctx.saved_tensors
-        found = torch.zeros_like(share), *(torch.empty_like(x) for x in (seen, factor, other))
-        many = [x.flatten(1) for x in (factor, other, grad, *found[1:])]
-        fixed, sums = [numpy_of(share.flatten())], [numpy_of(found[0].flatten())]
-        in_threads(path_loops.pull_energies, grad.numel(), [numpy_of(x) for x in (seen, *many)], fixed, sums)
-        return found
-
-    @staticmethod
-    def jvp(ctx: Any, *changes: Tensor | None) -> Any:
-        return _Energies.pushed(ctx, changes)
+        of_share, found = np.zeros_like(ctx.share), [np.empty_like(x) for x in ctx.rows]
+        rows = [*ctx.rows, numpy_of(grad.flatten(1)), *found]
+        in_threads(path_loops.pull_energies, grad.numel(), rows, [ctx.share], [of_share])
+        of_seen, of_factor, of_other = map(torch.from_numpy, found)
+        shape = grad.shape
+        return (
+            torch.from_numpy(of_share).view(shape[1:]),
+            of_seen,
+            of_factor.view(shape),
+            of_other.view(shape),
+        )
 
 
 def _rows(points: Tensor) -> np.ndarray:
@@ -401,7 +375,7 @@ class SplineSplat(torch.autograd.Function):
     @staticmethod
     def forward(contribution: Tensor, time: Tensor, n_bins: int) -> Tensor:
         """``[B, n_bins]`` in the unit of ``contribution``."""
-        if compiled(time):
+        if for_loops(time):
             padded = contribution.new_zeros(len(time), n_bins + path_loops.ROW)
             rows = [numpy_of(x) for x in (contribution, time, padded)]
             in_threads(path_loops.splat, time.numel(), rows)
@@ -453,7 +427,7 @@ def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
         (2.5, 1.0)
     """
     n_bins, padded = image.shape[1], torch.nn.functional.pad(image, (EDGE, EDGE + 3))
-    if compiled(time):
+    if for_loops(time):
         value, slope = torch.empty_like(time), torch.empty_like(time)
         rows = [numpy_of(padded), numpy_of(time), value.numpy(), slope.numpy()]
         in_threads(path_loops.spline_values, time.numel(), rows)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.functional import view_loops
-from nlos_lit.functional.compiled import compiled, in_threads, numpy_of
+from nlos_lit.functional.compiled import for_loops, in_threads, numpy_of
 from nlos_lit.functional.surfel_paths import quadrature, spread
 
 PIXEL = 1.75  # widths of a patch by the points along each side: they lie farther apart on slanted ones
@@ -86,7 +86,7 @@ def who_hides(
         drawn_at, depth = _seen_from(height, points, pixel)
         looked_at, own_depth = _seen_from(height, target, pixel)
         code = depth * STEPS + patch
-        if compiled(wall):
+        if for_loops(wall):
             rows = torch.nonzero(wall[:, 2] == height)[:, 0]
             order = code.argsort(descending=True)
             fixed = (drawn_at[:, :, order], code[order], looked_at, own_depth * STEPS, middle, normal, level)

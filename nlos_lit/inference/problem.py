@@ -30,6 +30,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
+from nlos_lit.functional.compiled import tensor_by_tensor
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
 
@@ -51,7 +52,7 @@ def pushed(function: Callable[..., Any], at: tuple[Tensor, ...], towards: tuple[
     Returns:
         value and derivative, of the form that ``function`` returns.
     """
-    with _dual:
+    with _dual, tensor_by_tensor():
         return torch.func.jvp(function, at, towards)
 
 

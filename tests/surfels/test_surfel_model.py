@@ -12,6 +12,7 @@ from data_modules.simulate import Mesh, ScanPlan, simulate_transients
 from data_modules.simulate.scenes import plate
 from nlos_lit.capture import Capture
 from nlos_lit.effects.hooks import NOTHING, Hooks
+from nlos_lit.functional.compiled import tensor_by_tensor
 from nlos_lit.functional.surfel_graph import (
     ALIKE,
     BEND,
@@ -288,9 +289,10 @@ def test_forward_mode_through_render_equals_reverse_mode():
     model, spots = random_model()
     shift = torch.randn(7, generator=torch.Generator().manual_seed(2))
     probe = torch.randn(3, 260, generator=torch.Generator().manual_seed(3))
-    _, forward = torch.func.jvp(
-        lambda z: _with(model, z, model.raw_albedo, spots), (model.raw_depth.detach(),), (shift,)
-    )
+    with tensor_by_tensor():
+        _, forward = torch.func.jvp(
+            lambda z: _with(model, z, model.raw_albedo, spots), (model.raw_depth.detach(),), (shift,)
+        )
     (gradient,) = torch.autograd.grad((model.render(spots) * probe).sum(), model.raw_depth)
     assert (forward * probe).sum().item() == pytest.approx((gradient @ shift).item(), rel=1e-3)
 
