@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +28,13 @@ def _leg(dx, dy, dz, fx, fy, fz, nx, ny, nz):
 
 
 @loop
-def legs(wall, normal, factor, way, cosine, p, f):
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel ``[B, N]`` of legs from wall points to points.
+def legs(wall, normal, factor, way, cosine, p, f) -> None:
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel of legs from wall points to points.
 
-    Wall points and their normals ``[B, 3]``, places and normals of points ``[3, N]``.
+    Args:
+        wall, normal: ``[B, 3]`` wall points, m, and their normals.
+        factor, way, cosine: ``[B, N]``, set.
+        p, f: ``[3, N]`` places, m, and normals of points.
     """
     for b in range(len(wall)):
         wx, wy, wz = wall[b]
@@ -46,8 +50,15 @@ def legs(wall, normal, factor, way, cosine, p, f):
 
 
 @loop
-def pull_legs(wall, normal, of_factor, of_way, of_cosine, p, f, of_p, of_f):
-    """Add the gradients of places and normals that come by those of :func:`legs`."""
+def pull_legs(wall, normal, of_factor, of_way, of_cosine, p, f, of_p, of_f) -> None:
+    """Gradients of :func:`legs`.
+
+    Args:
+        wall, normal: ``[B, 3]`` wall points, m, and their normals.
+        of_factor, of_way, of_cosine: ``[B, N]`` gradients of what it gives.
+        p, f: ``[3, N]`` places, m, and normals of points.
+        of_p, of_f: ``[3, N]`` their gradients, added to.
+    """
     for b in range(len(wall)):
         wx, wy, wz = wall[b]
         nx, ny, nz = normal[b]
@@ -71,9 +82,14 @@ def pull_legs(wall, normal, of_factor, of_way, of_cosine, p, f, of_p, of_f):
 
 
 @loop
-def energies(seen, factor, factor2, energy, share):
-    """What paths carry ``[B, N]``: areas of points ``[N]`` times what is seen of their surfels ``[B, M]``
-    times the factors ``[B, N]`` of both legs.
+def energies(seen, factor, factor2, energy, share) -> None:
+    """What paths carry: areas of points times what is seen of their surfels times the factors of both legs.
+
+    Args:
+        seen: ``[B, M]`` shares; of each surfel N/M points follow each other.
+        factor, factor2: ``[B, N]`` of the legs.
+        energy: ``[B, N]``, set.
+        share: ``[N]`` areas, m².
     """
     each = len(share) // seen.shape[1]
     sight = np.empty(len(share), np.float32)
@@ -87,8 +103,17 @@ def energies(seen, factor, factor2, energy, share):
 
 
 @loop
-def pull_energies(seen, factor, factor2, of_energy, of_seen, of_factor, of_factor2, share, of_share):
-    """Gradients of what :func:`energies` takes; adds to that of the areas, and sets the others."""
+def pull_energies(seen, factor, factor2, of_energy, of_seen, of_factor, of_factor2, share, of_share) -> None:
+    """Gradients of :func:`energies`.
+
+    Args:
+        seen: ``[B, M]`` shares.
+        factor, factor2: ``[B, N]`` of the legs.
+        of_energy: ``[B, N]`` gradient of what it gives.
+        of_seen, of_factor, of_factor2: gradients, set.
+        share: ``[N]`` areas, m².
+        of_share: ``[N]`` their gradient, added to.
+    """
     each = len(share) // seen.shape[1]
     sight, part = np.empty(len(share), np.float32), np.empty(len(share), np.float32)
     for b in range(len(seen)):
@@ -121,8 +146,13 @@ def _place(time, bins):
 
 
 @loop
-def splat(light, time, padded):
-    """Add light ``[B, K]`` that arrives at times ``[B, K]`` (bins) to padded rows ``[B, T + ROW]``."""
+def splat(light, time, padded) -> None:
+    """Light into bins by cubic B-splines.
+
+    Args:
+        light, time: ``[B, K]`` how much arrives, and when (bins).
+        padded: ``[B, T + ROW]``, added to.
+    """
     bins = np.float32(padded.shape[1] - ROW)
     for b in range(len(light)):
         row = padded[b]
@@ -136,8 +166,14 @@ def splat(light, time, padded):
 
 
 @loop
-def spline_values(padded, time, value, slope):
-    """What arrivals ``[B, K]`` see of padded rows ``[B, T + ROW]``, and its derivative by time."""
+def spline_values(padded, time, value, slope) -> None:
+    """What arrivals see of bins through their shares, the transpose of :func:`splat`.
+
+    Args:
+        padded: ``[B, T + ROW]``.
+        time: ``[B, K]`` of the arrivals, bins.
+        value, slope: ``[B, K]`` what they see, and its derivative by time, set.
+    """
     bins = np.float32(padded.shape[1] - ROW)
     for b in range(len(time)):
         row = padded[b]
@@ -151,12 +187,16 @@ def spline_values(padded, time, value, slope):
 
 
 @loop
-def runs(light, time, bins):
+def runs(light, time, bins) -> Any:
     """What the light of sources does to bins: of each source at each spot a run of bins, and its shares.
 
-    ``light`` and ``time`` (bins) ``[B, M, Q]`` of Q points of each of M sources, per unit of the source's
-    light. Begins, in padded rows, and the first ``BLOCK`` of shares ``[B, M + 1]``, and all shares ``[n,
-    BLOCK]``.
+    Args:
+        light, time: ``[B, M, Q]`` of Q points of each of M sources: per unit of the source's light, and bins.
+        bins: T.
+
+    Returns:
+        ``[B, M]`` where runs begin in padded rows, ``[B, M + 1]`` their first ``BLOCK`` of shares, and all
+        shares ``[n, BLOCK]``.
     """
     spots, sources, points = time.shape
     begin, block = np.empty((spots, sources), np.int32), np.zeros((spots, sources + 1), np.int64)
@@ -186,8 +226,14 @@ def runs(light, time, bins):
 
 
 @loop
-def send(begin, block, share, light, padded):
-    """Add the light ``[M]`` of sources to rows ``[B, T + ROW + BLOCK]``, by their :func:`runs`."""
+def send(begin, block, share, light, padded) -> None:
+    """Light of sources into bins, by their :func:`runs`.
+
+    Args:
+        begin, block, share: the runs.
+        light: ``[M]`` of the sources.
+        padded: ``[B, T + ROW + BLOCK]``, added to.
+    """
     for b in range(len(begin)):
         row = padded[b]
         for m in range(len(light)):
@@ -199,8 +245,14 @@ def send(begin, block, share, light, padded):
 
 
 @loop
-def pull_send(begin, block, share, padded, of_light):
-    """Add to the gradient ``[M]`` of what :func:`send` sends."""
+def pull_send(begin, block, share, padded, of_light) -> None:
+    """Gradient of :func:`send`.
+
+    Args:
+        begin, block, share: the runs.
+        padded: ``[B, T + ROW + BLOCK]`` gradient of the bins.
+        of_light: ``[M]`` that of the light, added to.
+    """
     for b in range(len(begin)):
         row = padded[b]
         for m in range(len(of_light)):
@@ -213,12 +265,19 @@ def pull_send(begin, block, share, padded, of_light):
 
 
 @loop
-def emg(number, first, sigma, kappa):
-    """``[3, number]`` distribution function F of an exponentially modified Gaussian at steps of 1 from
-    ``first`` on, and its slopes by σ and by κ.
+def emg(number, first, sigma, kappa) -> Any:
+    """Distribution function F of an exponentially modified Gaussian at steps of 1, and its slopes.
 
     With φ the normal density, Φ its integral and E = Φ(t/σ) - F, ∂F/∂σ = κ (φ(t/σ) - κσE) and ∂F/∂κ =
     (t - κσ²) E + σ φ(t/σ).
+
+    Args:
+        number: of steps.
+        first: t of the first.
+        sigma, kappa: σ and κ, in steps and one over steps.
+
+    Returns:
+        ``[3, number]`` double precision: F, its slope by σ, and by κ.
     """
     found = np.empty((3, number))
     for n in range(number):

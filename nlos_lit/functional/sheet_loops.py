@@ -4,6 +4,8 @@ patches of :mod:`~nlos_lit.functional.surfel_paths`. Pairs are two arrays ``i`` 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from nlos_lit.functional.compiled import inlined, loop
@@ -13,8 +15,18 @@ ONE, TWO, HALF, ZERO = (np.float32(x) for x in (1, 2, 0.5, 0))
 
 
 @loop
-def carried(i, j, mean, own, shift, times):
-    """``[M]`` averages of averages over neighbours."""
+def carried(i, j, mean, own, shift, times) -> Any:
+    """Averages of averages over neighbours.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        mean, own: ``[P]`` shares of j in the average about i, and ``[M]`` of i itself.
+        shift: ``[M]``.
+        times: how often.
+
+    Returns:
+        ``[M]``.
+    """
     for _ in range(times):
         now = own * shift
         for p in range(len(i)):
@@ -24,8 +36,18 @@ def carried(i, j, mean, own, shift, times):
 
 
 @loop
-def pull_carried(i, j, mean, own, grad, times):
-    """The transpose of :func:`carried`."""
+def pull_carried(i, j, mean, own, grad, times) -> Any:
+    """The transpose of :func:`carried`.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        mean, own: ``[P]`` and ``[M]`` shares.
+        grad: ``[M]`` of what it gives.
+        times: how often.
+
+    Returns:
+        ``[M]`` gradient of the shifts.
+    """
     for _ in range(times):
         now = own * grad
         for p in range(len(i)):
@@ -40,7 +62,7 @@ def _away(c, a, b):
 
 
 @loop
-def _leaning(normal, first, second, slope, facing, length):
+def _leaning(normal, first, second, slope, facing, length) -> None:
     for m in range(len(normal)):
         x, y, z = (
             normal[m, 0] - slope[m, 0] * first[m, 0] - slope[m, 1] * second[m, 0],
@@ -52,7 +74,7 @@ def _leaning(normal, first, second, slope, facing, length):
 
 
 @loop
-def _pull_leaning(first, second, facing, length, grad, of_slope):
+def _pull_leaning(first, second, facing, length, grad, of_slope) -> None:
     for m in range(len(first)):
         along = facing[m, 0] * grad[m, 0] + facing[m, 1] * grad[m, 1] + facing[m, 2] * grad[m, 2]
         for k in range(3):
@@ -62,8 +84,19 @@ def _pull_leaning(first, second, facing, length, grad, of_slope):
 
 
 @loop
-def normals(i, j, centre, normal, first, second, share, rest, bow, rim):
-    """Normals ``[M, 3]`` of sheets, and what they were in the first place, with the lengths of both."""
+def normals(i, j, centre, normal, first, second, share, rest, bow, rim) -> Any:
+    """Normals of a sheet, see :func:`~nlos_lit.functional.surfel_graph.sheet_normals`.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        centre: ``[M, 3]`` m, where surfels are now.
+        normal, first, second, share, rest, bow: of the sheet.
+        rim: ``[M]`` how much of their neighbours surfels lack.
+
+    Returns:
+        ``[M, 3]`` normals, ``[M, 3]`` those of the planes that were laid first, and ``[M]`` the lengths of
+        these and of those before they were normalised.
+    """
     m = len(normal)
     slope, plane, facing = (
         np.zeros((m, 2), np.float32),
@@ -90,8 +123,20 @@ def normals(i, j, centre, normal, first, second, share, rest, bow, rim):
 
 
 @loop
-def pull_normals(i, j, centre, normal, first, second, share, rim, facing, plane, length, length2, grad):
-    """Gradient ``[M, 3]`` of places from that of :func:`normals`."""
+def pull_normals(
+    i, j, centre, normal, first, second, share, rim, facing, plane, length, length2, grad
+) -> Any:
+    """Gradient of :func:`normals`.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        centre, normal, first, second, share, rim: as there.
+        facing, plane, length, length2: what it gives.
+        grad: ``[M, 3]`` of the normals.
+
+    Returns:
+        ``[M, 3]`` of the places.
+    """
     of_slope, of_plane, of_centre = (
         np.zeros((len(normal), 2), np.float32),
         np.zeros_like(normal),
@@ -118,8 +163,18 @@ def pull_normals(i, j, centre, normal, first, second, share, rim, facing, plane,
 
 
 @loop
-def bending(i, j, centre, normal, weight, bend, stiffness):
-    """Cost of bends, and its gradients by places and normals ``[M, 3]``."""
+def bending(i, j, centre, normal, weight, bend, stiffness) -> Any:
+    """Cost of bends, see :func:`~nlos_lit.functional.surfel_graph.bending`, with its gradients.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        centre, normal: ``[M, 3]`` m, and unit.
+        weight: ``[M]`` trust.
+        bend, stiffness: constants of the cost.
+
+    Returns:
+        nats, and ``[M, 3]`` gradients by places and by normals.
+    """
     total, of_centre, of_normal = 0.0, np.zeros_like(centre), np.zeros_like(normal)
     for p in range(len(i)):
         a, b = i[p], j[p]
@@ -145,8 +200,19 @@ def bending(i, j, centre, normal, weight, bend, stiffness):
 
 
 @loop
-def albedo_costs(i, j, albedo, level, evenness, bright, there, edge, alike, deviation, least):
-    """Cost of steps between neighbours, of brightness and of presence, and its gradient ``[M]``."""
+def albedo_costs(i, j, albedo, level, evenness, bright, there, edge, alike, deviation, least) -> Any:
+    """What albedos cost, see :func:`~nlos_lit.functional.surfel_graph.albedo_cost`, and the gradient.
+
+    Args:
+        i, j: ``[P]`` pairs of neighbours.
+        albedo: ``[M]``.
+        level: of the scene.
+        evenness, bright, there: weights.
+        edge, alike, deviation, least: constants of the costs.
+
+    Returns:
+        nats, and ``[M]`` the gradient.
+    """
     total, of_albedo = 0.0, np.zeros_like(albedo)
     for p in range(len(i)):
         step = (albedo[i[p]] - albedo[j[p]]) / level
@@ -168,8 +234,17 @@ def albedo_costs(i, j, albedo, level, evenness, bright, there, edge, alike, devi
 
 
 @loop
-def patches(normal, curvature, cell, offsets, steep, place, facing, share):
-    """Places ``[M, Q, 3]`` relative to the middles of patches, normals there, and areas ``[M, Q]``."""
+def patches(normal, curvature, cell, offsets, steep, place, facing, share) -> None:
+    """Points of patches, see :func:`~nlos_lit.functional.surfel_paths.patches`.
+
+    Args:
+        normal: ``[M, 3]`` unit.
+        curvature: ``[M, 3, 3]`` 1/m, symmetric; ``[0, 3, 3]`` where patches are flat.
+        cell: ``[2]`` lateral extents, m.
+        offsets: ``[Q, 2]`` in cells.
+        steep: cosine up to which a patch covers its cell.
+        place, facing, share: ``[M, Q, 3]`` places and normals, ``[M, Q]`` areas, set.
+    """
     curved = len(curvature) > 0
     for m in range(len(normal)):
         nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]
@@ -197,8 +272,16 @@ def patches(normal, curvature, cell, offsets, steep, place, facing, share):
 
 
 @loop
-def pull_patches(normal, curvature, cell, offsets, steep, of_place, of_facing, of_share):
-    """Gradient ``[M, 3]`` of normals from those of :func:`patches`; ``curvature`` stands still."""
+def pull_patches(normal, curvature, cell, offsets, steep, of_place, of_facing, of_share) -> Any:
+    """Gradient of :func:`patches`; curvature stands still.
+
+    Args:
+        normal, curvature, cell, offsets, steep: as there.
+        of_place, of_facing, of_share: gradients of what it gives.
+
+    Returns:
+        ``[M, 3]`` of the normals.
+    """
     found, curved = np.empty_like(normal), len(curvature) > 0
     for m in range(len(normal)):
         nx, ny, nz = normal[m, 0], normal[m, 1], normal[m, 2]

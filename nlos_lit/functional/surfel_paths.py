@@ -458,6 +458,9 @@ class Runs(NamedTuple):
             time: ``[B, M, Q]`` in bins.
             n_bins: T.
 
+        Returns:
+            on the CPU.
+
         Examples:
             >>> runs = Runs.of(torch.ones(1, 1, 1), torch.full((1, 1, 1), 2.5), 5)
             >>> runs.send(torch.tensor([6.0]))

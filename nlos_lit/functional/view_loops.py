@@ -8,12 +8,28 @@ from nlos_lit.functional.compiled import loop
 
 
 @loop
-def pictures(wall, rows, drawn, code, looked, front, middle, normal, level, names, behind, by, clear, steps):
-    """For every wall point ``[W, 3]`` which patch hides which point of targets, in ``rows`` of ``by`` ``[…,
-    V, K]`` and of the targets ``behind``.
+def pictures(
+    wall, rows, drawn, code, looked, front, middle, normal, level, names, behind, by, clear, steps
+) -> None:
+    """Which patch hides which point of targets from each wall point.
 
-    A picture is drawn, what is nearer over what is farther, and looked at. ``code`` is the drawn points'
-    depth, as many steps a metre, times ``steps``, and the number of the patch, in falling order.
+    A picture is drawn, what is nearer over what is farther, and looked at.
+
+    Args:
+        wall: ``[W, 3]`` m, of one height.
+        rows: ``[W]`` of ``by``.
+        drawn: ``[2, 3, D]`` of the points of patches, see ``surfel_visibility._seen_from``.
+        code: ``[D]`` their depths, in ``steps`` a metre, times ``steps``, and the numbers of their patches,
+            in falling order.
+        looked: ``[2, 3, P]`` of the points of targets.
+        front: ``[P]`` their depths, times ``steps``.
+        middle: ``[P, 3]`` m, of their targets.
+        normal, level: ``[M, 3]`` and ``[M]`` of the patches' planes.
+        names: ``[M]`` of the patches.
+        behind: ``[V']`` of the targets in ``by``.
+        by: ``[…, V, K]`` int32, set where something hides.
+        clear: m behind a patch's plane up to which it hides nothing.
+        steps: see ``code``.
     """
     u, v = np.empty(looked.shape[2], np.int32), np.empty(looked.shape[2], np.int32)
     a, b = np.empty(drawn.shape[2], np.int32), np.empty(drawn.shape[2], np.int32)
@@ -45,7 +61,7 @@ def pictures(wall, rows, drawn, code, looked, front, middle, normal, level, name
 
 
 @loop
-def _columns_of(wall, seen, u, v):
+def _columns_of(wall, seen, u, v) -> None:
     """Column and row of each of some points in the picture from a wall point."""
     x, y = -wall[0], -wall[1]
     for p in range(len(u)):

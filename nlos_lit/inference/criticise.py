@@ -706,7 +706,7 @@ class Loop:
             value = log_likelihood(fit, self.split.select)
             trials.append(Trial(c, fit, value, compare(none.likelihood, value, self.block)))
         trials = weighed(trials, self.block)
-        best = chosen(trials, s.odds)
+        best = chosen(trials, s.odds, self.least)
         assert best.candidate is not None
         group = group_of(best, trials, self.block, s.open_share)
         return replace(member, candidate=best.candidate, trials=trials, group=group)

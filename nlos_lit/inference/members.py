@@ -207,13 +207,14 @@ def weighed(trials: list[Trial], block: np.ndarray) -> list[Trial]:
     return sorted(found, key=lambda t: -t.gain.nats)
 
 
-def chosen(trials: list[Trial], odds: float) -> Trial:
+def chosen(trials: list[Trial], odds: float, least: float) -> Trial:
     """The simplest of those that gain most.
 
     Args:
         trials: in one place, with weights, the largest gain first; none is not chosen.
         odds: share of the best one's weight from which on a simpler one goes before it, as it does from
-            ``MOST`` of its gain on; but no effect before a free term that predicts better by so much weight.
+            ``MOST`` of its gain on; but no effect before a free term that predicts better by so much weight …
+        least: … or that, doing what the effect cannot, is asked for by so many nats more.
 
     Returns:
         an effect before a free term, few coefficients before many.
@@ -221,7 +222,11 @@ def chosen(trials: list[Trial], odds: float) -> Trial:
     first, *others = [t for t in trials if t.candidate is not None]
 
     def near(trial: Trial) -> bool:
-        unknown = first.name in FREE_NAMES and trial.name not in FREE_NAMES
+        one, other = first.candidate, trial.candidate
+        assert one is not None and other is not None
+        unknown = one.free and not other.free
+        if unknown and one.name not in other.effect.followed_by and one.evidence > other.evidence + least:
+            return False
         gains = trial.gain.nats >= MOST * first.gain.nats and not unknown
         return gains or trial.weight >= odds * first.weight
 

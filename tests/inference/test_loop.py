@@ -238,11 +238,12 @@ def gained(name: str, nats: float, weight: float = 0.01) -> Trial:
 
 def test_the_simplest_of_the_terms_that_gain_most():
     """Nine tenths of the best gain, or a quarter of its weight, are enough for fewer coefficients; a quarter
-    of its weight for an effect beside a free term.
+    of its weight for an effect beside a free term, unless that is asked for by 8 nats more and does what the
+    effect cannot.
     """
 
     def name(*trials: Trial) -> str:
-        return chosen(sorted(trials, key=lambda t: -t.gain.nats), SETTINGS.odds).name
+        return chosen(sorted(trials, key=lambda t: -t.gain.nats), SETTINGS.odds, LEAST).name
 
     wide, free = gained("wall_reflectance", 100.0, 0.8), gained("free_rate", 100.0, 0.8)
     assert len(wide.candidate.step) > len(free.candidate.step) > 1
@@ -252,6 +253,10 @@ def test_the_simplest_of_the_terms_that_gain_most():
     assert name(wide, gained("vignetting", 50.0, 0.199)) == "wall_reflectance"
     assert name(free, gained("wall_reflectance", 99.0, 0.201)) == "wall_reflectance"
     assert name(free, gained("wall_reflectance", 99.0, 0.199)) == "free_rate"
+    for more, cannot in ((0.1, "free_rate"), (-0.1, "wall_reflectance")):
+        for does, said in (("free_rate", cannot), ("free_wall", "wall_reflectance")):
+            asked = replace(gained(does, 100.0, 0.8), candidate=candidate(does, 100.0 + LEAST + more))
+            assert name(asked, gained("wall_reflectance", 99.0, 0.7)) == said
 
 
 def test_trials_stand_by_gain_with_their_weights():
