@@ -7,7 +7,8 @@
 
 Settings of the fit and constants of ``nlos_lit`` can be changed, to see how much hangs on them. Prints one
 JSON line a fit. For drawn scenes the noise is the deviance of the same counts under the true expectation;
-otherwise that of counts drawn from the fit. ``pictures=DIR`` also leaves an overview of each fit. One thread.
+otherwise that of counts drawn from the fit. ``pictures=DIR`` also leaves an overview of each fit. One thread,
+or ``threads=N``.
 """
 
 from __future__ import annotations
@@ -222,8 +223,8 @@ def fit_rows(case: Case, options: dict[str, str]) -> None:
 
 def main(arguments: list[str]) -> None:
     """Read ``name=value`` arguments and print the rows."""
-    torch.set_num_threads(1)
     options = dict(argument.split("=", 1) for argument in arguments)
+    torch.set_num_threads(int(options.get("threads", 1)))
     for number in options.get("draw", "").split(","):
         if number:
             fit_rows(drawn(int(number)), options)

@@ -223,7 +223,8 @@ def chosen(trials: list[Trial], odds: float, least: float) -> Trial:
 
     def near(trial: Trial) -> bool:
         one, other = first.candidate, trial.candidate
-        assert one is not None and other is not None
+        assert one is not None
+        assert other is not None
         unknown = one.free and not other.free
         if unknown and one.name not in other.effect.followed_by and one.evidence > other.evidence + least:
             return False
