@@ -1,4 +1,4 @@
-"""Compiled loops: how they are made, what they take, and how threads share them.
+"""Compiled loops: how they are made, and what they take.
 
 Tensor by tensor each operation passes once through memory, and small scenes wait for the calls. A compiled
 loop keeps what it works on in registers. It takes contiguous arrays of single precision. On other devices,
@@ -7,21 +7,17 @@ and within :func:`tensor_by_tensor`, the same is said by operations of torch bes
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from numba import njit
 from torch import Tensor
 
-Of = TypeVar("Of")  # what is found
 _plainly = ContextVar("plainly", default=False)
-WORTH = 1 << 16  # steps of a loop from which on a second thread is asked
 # Sums in any order; what is no number stays none.
 LOOSE = {"reassoc", "contract", "arcp", "nsz"}
 
@@ -74,63 +70,3 @@ def tensor_by_tensor() -> Iterator[None]:
 def numpy_of(values: Tensor) -> np.ndarray:
     """The same memory where it is contiguous, without gradients."""
     return values.detach().contiguous().numpy()
-
-
-def in_threads(
-    loop: Callable[..., None],
-    paths: int,
-    rows: Sequence[np.ndarray],
-    fixed: Sequence[Any] = (),
-    sums: Sequence[np.ndarray] = (),
-) -> None:
-    """Run a loop over the rows of arrays, by as many threads as torch may have.
-
-    Args:
-        loop: called with some of ``rows``, all of ``fixed``, and ``sums`` to which it adds.
-        paths: in all rows; few are not worth a thread.
-        rows: arrays whose first axis is divided; those of no rows are empty for all.
-        fixed: whole for all.
-        sums: over all rows; each thread has its own until it ends.
-    """
-    number = len(rows[0])
-    parts = min(torch.get_num_threads(), number) if paths > WORTH else 1
-    if parts == 1:
-        loop(*rows, *fixed, *sums)
-        return
-    cuts = [round(k * number / parts) for k in range(parts + 1)]
-    own = [sums, *([np.zeros_like(s) for s in sums] for _ in range(parts - 1))]
-    jobs = [
-        _pool(parts).submit(loop, *(a[low:high] for a in rows), *fixed, *mine)
-        for low, high, mine in zip(cuts, cuts[1:], own, strict=False)
-    ]
-    for job in jobs:
-        job.result()
-    for mine in own[1:]:
-        for whole, part in zip(sums, mine, strict=True):
-            whole += part
-
-
-def side_by_side(work: Callable[..., Of], *given: Sequence[Any]) -> list[Of]:
-    """``[work(a, b, …), …]`` by as many threads as torch may have, each of which has torch for itself.
-
-    Args:
-        work: called with one of each.
-        given: of one length.
-
-    Returns:
-        in the order of ``given``.
-    """
-    threads = min(torch.get_num_threads(), len(given[0]))
-    if threads == 1:
-        return list(map(work, *given))
-
-    def alone(*one: Any) -> Of:
-        torch.set_num_threads(1)  # of this thread
-        return work(*one)
-
-    return list(_pool(threads).map(alone, *given))
-
-
-@cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.functional import path_loops, sheet_loops
-from nlos_lit.functional.compiled import compiled, for_loops, in_threads, numpy_of
+from nlos_lit.functional.compiled import compiled, for_loops, numpy_of
 from nlos_lit.functional.path_loops import EDGE
 
 STEEP = 0.4  # cosine of the tilt up to which a patch covers its whole lateral cell
@@ -262,14 +262,13 @@ class _Legs(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         factor, leg, cosine = found = points.new_empty(3, len(wall), *points.shape[:2])
         ctx.walls, ctx.points = [numpy_of(wall), numpy_of(normal)], [_rows(points), _rows(facing)]
-        in_threads(path_loops.legs, leg.numel(), [*ctx.walls, *found.flatten(2).numpy()], ctx.points)
+        path_loops.legs(*ctx.walls, *found.flatten(2).numpy(), *ctx.points)
         return factor, leg, cosine
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None]:
         found = np.zeros((2, *ctx.points[0].shape), np.float32)
-        rows = [*ctx.walls, *(numpy_of(g.flatten(1)) for g in grads)]
-        in_threads(path_loops.pull_legs, grads[0].numel(), rows, ctx.points, list(found))
+        path_loops.pull_legs(*ctx.walls, *(numpy_of(g.flatten(1)) for g in grads), *ctx.points, *found)
         of_points, of_facing = (torch.from_numpy(x).T.reshape(*grads[0].shape[1:], 3) for x in found)
         return of_points, of_facing, None, None
 
@@ -293,14 +292,13 @@ class _Energies(torch.autograd.Function):
         energy = torch.empty_like(factor)
         ctx.rows = [numpy_of(x) for x in (seen, factor.flatten(1), other.flatten(1))]
         ctx.share = numpy_of(share.flatten())
-        in_threads(path_loops.energies, energy.numel(), [*ctx.rows, energy.flatten(1).numpy()], [ctx.share])
+        path_loops.energies(*ctx.rows, energy.flatten(1).numpy(), ctx.share)
         return energy
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
         of_share, found = np.zeros_like(ctx.share), [np.empty_like(x) for x in ctx.rows]
-        rows = [*ctx.rows, numpy_of(grad.flatten(1)), *found]
-        in_threads(path_loops.pull_energies, grad.numel(), rows, [ctx.share], [of_share])
+        path_loops.pull_energies(*ctx.rows, numpy_of(grad.flatten(1)), *found, ctx.share, of_share)
         of_seen, of_factor, of_other = map(torch.from_numpy, found)
         shape = grad.shape
         return (
@@ -377,8 +375,7 @@ class SplineSplat(torch.autograd.Function):
         """``[B, n_bins]`` in the unit of ``contribution``."""
         if for_loops(time):
             padded = contribution.new_zeros(len(time), n_bins + path_loops.ROW)
-            rows = [numpy_of(x) for x in (contribution, time, padded)]
-            in_threads(path_loops.splat, time.numel(), rows)
+            path_loops.splat(*map(numpy_of, (contribution, time, padded)))
             return padded[:, EDGE : EDGE + n_bins].contiguous()
         place, f = _located(time, n_bins)
         first = contribution * f
@@ -429,8 +426,7 @@ def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:
     n_bins, padded = image.shape[1], torch.nn.functional.pad(image, (EDGE, EDGE + 3))
     if for_loops(time):
         value, slope = torch.empty_like(time), torch.empty_like(time)
-        rows = [numpy_of(padded), numpy_of(time), value.numpy(), slope.numpy()]
-        in_threads(path_loops.spline_values, time.numel(), rows)
+        path_loops.spline_values(*map(numpy_of, (padded, time, value, slope)))
         return value, slope
     place, f = _located(time, n_bins)
     bins = torch.stack([padded[:, k : k + n_bins + 2 * EDGE].reshape(-1) for k in range(4)])

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from nlos_lit.functional import view_loops
-from nlos_lit.functional.compiled import for_loops, in_threads, numpy_of
+from nlos_lit.functional.compiled import for_loops, numpy_of
 from nlos_lit.functional.surfel_paths import quadrature, spread
 
 PIXEL = 1.75  # widths of a patch by the points along each side: they lie farther apart on slanted ones
@@ -90,9 +90,8 @@ def who_hides(
             rows = torch.nonzero(wall[:, 2] == height)[:, 0]
             order = code.argsort(descending=True)
             fixed = (drawn_at[:, :, order], code[order], looked_at, own_depth * STEPS, middle, normal, level)
-            given = [*map(numpy_of, (*fixed, names, behind, found_by)), CLEAR * float(side), STEPS]
-            work = len(rows) * (len(code) + len(target))
-            in_threads(view_loops.pictures, work, [numpy_of(wall[rows]), numpy_of(rows)], given)
+            given = map(numpy_of, (wall[rows], rows, *fixed, names, behind, found_by))
+            view_loops.pictures(*given, CLEAR * float(side), STEPS)
             continue
         for rows in torch.nonzero(wall[:, 2] == height)[:, 0].split(size):
             part = wall[rows]

@@ -8,7 +8,6 @@ the likeliest albedo is zero.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ from torch import Tensor
 
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
-from nlos_lit.functional.compiled import side_by_side
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import flank, ring
 from nlos_lit.functional.surfel_paths import Runs
@@ -129,7 +127,8 @@ def solve_albedos(
         x = torch.tensor(levels, dtype=torch.float32, device=device, requires_grad=True)
         prior = model.albedo_cost(*weights, level * x)
         total, slope = float(prior.detach()), torch.autograd.grad(prior, x)[0].double().cpu().numpy()
-        each = side_by_side(partial(misfit, level * x.detach()), parts, counts.split(size))
+        sent = level * x.detach()
+        each = [misfit(sent, part, seen) for part, seen in zip(parts, counts.split(size), strict=True)]
         return total + sum(nats for nats, _ in each), slope + level * sum(pull for _, pull in each)
 
     begin = (model.albedo().detach() / level).double().cpu().numpy()

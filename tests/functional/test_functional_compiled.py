@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from nlos_lit.functional import irf, surfel_graph, surfel_paths, surfel_visibility
-from nlos_lit.functional.compiled import in_threads, side_by_side
-from nlos_lit.functional.path_loops import ROW, spline_values
 from nlos_lit.functional.surfel_graph import (
     albedo_cost,
     bending,
@@ -198,36 +195,3 @@ def test_response_and_its_slopes(sigma, kappa):
         leaves = [x.clone().requires_grad_() for x in given]
         pulls.append(torch.stack(torch.autograd.grad((weight * function(*leaves)).sum(), leaves)))
     assert pulls[0] == pytest.approx(pulls[1], abs=1e-6)
-
-
-def test_threads_divide_rows_and_add_their_sums(monkeypatch):
-    """Rows go to as many threads as torch may have, if there is work enough for them."""
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
-    seen, given, total = [], np.arange(10.0)[:, None], np.zeros(1)
-
-    def loop(rows: np.ndarray, factor: float, total: np.ndarray) -> None:
-        seen.append(len(rows))
-        total += factor * rows.sum()
-
-    for work, parts in ((1 << 20, [3, 3, 4]), (100, [10])):
-        seen.clear()
-        total[:] = 0
-        in_threads(loop, work, [given], [2.0], [total])
-        assert (sorted(seen), total.item()) == (parts, 90.0)
-
-
-def test_side_by_side_keeps_the_order(monkeypatch):
-    """Each thread has torch for itself; the caller keeps its own."""
-    monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    assert side_by_side(lambda a, b: a - b, [5, 6, 7], [1, 2, 3]) == [4, 4, 4]
-
-
-def test_threads_change_no_path(monkeypatch):
-    time, image = 40 * torch.rand(64, 2000, generator=GEN), randn(64, 40 + ROW).numpy()
-    found = []
-    for threads in (1, 2):
-        monkeypatch.setattr(torch, "get_num_threads", lambda n=threads: n)
-        value, slope = (np.empty((64, 2000), np.float32) for _ in range(2))
-        in_threads(spline_values, time.numel(), [image, time.numpy(), value, slope])
-        found.append((value, slope))
-    assert all(np.array_equal(*pair) for pair in zip(*found, strict=True))
