@@ -795,10 +795,8 @@ def criticise(
         """What holds of those that came, beside what is held."""
         if not new:
             return beside
-        scenes = [loop.fine(coarse, "with_all"), coarse]
-        if all(m.candidate.free for m in new):  # they must not be judged by a scene that came out worse
-            scenes.append(loop.gone_on(beside.scene, [m.candidate for m in new]))
-        tried, scene, left = loop.hold(new, loop.better(*scenes), coarse, beside)
+        grown = loop.better(loop.fine(coarse, "with_all"), coarse)
+        tried, scene, left = loop.hold(new, grown, coarse, beside)
         now = {m.name: m for m in tried}
         found.members = [now.get(m.name, m) for m in found.members]
         return Held(beside.members + [m for m in tried if m.stays], scene, left or coarse)
