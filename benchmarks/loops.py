@@ -1,4 +1,4 @@
-"""What compiled loops save: a batch of the surface fit, who hides whom and albedos, beside tensor by tensor.
+"""What compiled loops save: a batch of the surface fit, and who hides whom, beside tensor by tensor.
 
     python benchmarks/loops.py
 

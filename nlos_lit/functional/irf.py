@@ -83,9 +83,8 @@ class _Response(torch.autograd.Function):
 
     @staticmethod
     def forward(sigma: Tensor, kappa: Tensor, n_bins: int, lead: int) -> tuple[Tensor, Tensor]:
-        from nlos_lit.functional.path_loops import (
-            emg,  # a machine that simulates on a GPU alone needs no numba
-        )
+        # A machine that simulates on a GPU alone needs no numba.
+        from nlos_lit.functional.path_loops import emg
 
         found = np.diff(emg(n_bins + 1, -lead - 0.5, sigma.item(), kappa.item())).astype(np.float32)
         return torch.from_numpy(found[0]), torch.from_numpy(found[1:])

@@ -145,6 +145,14 @@ def _place(time, bins):
     return np.int64(whole) + EDGE - 1, since - whole
 
 
+@inlined
+def _shares(light, s):
+    """What each of the four bins gets at a phase."""
+    v, left = light / SIX, ONE - s
+    second = v * (FOUR + s * s * (THREE * s - SIX))
+    return v * left * left * left, second, v * (ONE + THREE * s * (ONE + s - s * s)), v * s * s * s
+
+
 @loop
 def splat(light, time, padded) -> None:
     """Light into bins by cubic B-splines.
@@ -158,11 +166,11 @@ def splat(light, time, padded) -> None:
         row = padded[b]
         for k in range(light.shape[1]):
             i, s = _place(time[b, k], bins)
-            v, left = light[b, k] / SIX, ONE - s
-            row[i] += v * left * left * left
-            row[i + 1] += v * (FOUR + s * s * (THREE * s - SIX))
-            row[i + 2] += v * (ONE + THREE * s * (ONE + s - s * s))
-            row[i + 3] += v * s * s * s
+            first, second, third, fourth = _shares(light[b, k], s)
+            row[i] += first
+            row[i + 1] += second
+            row[i + 2] += third
+            row[i + 3] += fourth
 
 
 @loop
@@ -204,12 +212,12 @@ def runs(light, time, bins) -> Any:
         if b:
             block[b, 0] = block[b - 1, sources]
         for m in range(sources):
-            first, last = bins + ROW, 0
+            low, high = np.int64(bins) + ROW, 0
             for q in range(points):
                 i, _ = _place(time[b, m, q], bins)
-                first, last = min(first, i), max(last, i + 4)
-            begin[b, m] = first
-            block[b, m + 1] = block[b, m] + (last - first + BLOCK - 1) // BLOCK
+                low, high = min(low, i), max(high, i + 4)
+            begin[b, m] = low
+            block[b, m + 1] = block[b, m] + (high - low + BLOCK - 1) // BLOCK
     share = np.zeros((block[spots - 1, sources], BLOCK), np.float32)
     flat = share.reshape(-1)
     for b in range(spots):
@@ -217,11 +225,11 @@ def runs(light, time, bins) -> Any:
             at = block[b, m] * BLOCK - begin[b, m]
             for q in range(points):
                 i, s = _place(time[b, m, q], bins)
-                v, left = light[b, m, q] / SIX, ONE - s
-                flat[at + i] += v * left * left * left
-                flat[at + i + 1] += v * (FOUR + s * s * (THREE * s - SIX))
-                flat[at + i + 2] += v * (ONE + THREE * s * (ONE + s - s * s))
-                flat[at + i + 3] += v * s * s * s
+                first, second, third, fourth = _shares(light[b, m, q], s)
+                flat[at + i] += first
+                flat[at + i + 1] += second
+                flat[at + i + 2] += third
+                flat[at + i + 3] += fourth
     return begin, block, share
 
 

@@ -16,7 +16,7 @@ ONE, TWO, HALF, ZERO = (np.float32(x) for x in (1, 2, 0.5, 0))
 
 @loop
 def carried(i, j, mean, own, shift, times) -> Any:
-    """Averages of averages over neighbours.
+    """Averages of averages over neighbours. With i and j exchanged it is its own transpose.
 
     Args:
         i, j: ``[P]`` pairs of neighbours.
@@ -33,27 +33,6 @@ def carried(i, j, mean, own, shift, times) -> Any:
             now[i[p]] += mean[p] * shift[j[p]]
         shift = now
     return shift
-
-
-@loop
-def pull_carried(i, j, mean, own, grad, times) -> Any:
-    """The transpose of :func:`carried`.
-
-    Args:
-        i, j: ``[P]`` pairs of neighbours.
-        mean, own: ``[P]`` and ``[M]`` shares.
-        grad: ``[M]`` of what it gives.
-        times: how often.
-
-    Returns:
-        ``[M]`` gradient of the shifts.
-    """
-    for _ in range(times):
-        now = own * grad
-        for p in range(len(i)):
-            now[j[p]] += mean[p] * grad[i[p]]
-        grad = now
-    return grad
 
 
 @inlined

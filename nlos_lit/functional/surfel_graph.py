@@ -237,12 +237,13 @@ class _Carried(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, shift: Tensor, sheet: Sheet) -> Tensor:
-        ctx.given = tuple(numpy_of(x) for x in (*sheet.pairs, sheet.mean, sheet.own))
-        return torch.from_numpy(sheet_loops.carried(*ctx.given, numpy_of(shift), AVERAGES))
+        ctx.i, ctx.j, *ctx.shares = (numpy_of(x) for x in (*sheet.pairs, sheet.mean, sheet.own))
+        return torch.from_numpy(sheet_loops.carried(ctx.i, ctx.j, *ctx.shares, numpy_of(shift), AVERAGES))
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return torch.from_numpy(sheet_loops.pull_carried(*ctx.given, numpy_of(grad), AVERAGES)), None
+        pulled = sheet_loops.carried(ctx.j, ctx.i, *ctx.shares, numpy_of(grad), AVERAGES)
+        return torch.from_numpy(pulled), None
 
 
 class _Normals(torch.autograd.Function):
