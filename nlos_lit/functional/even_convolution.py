@@ -34,7 +34,7 @@ class EvenAxis:
         self.lags = torch.arange(self.half, dtype=torch.float64, device=device)
         turn = 2 * math.pi / self.length
         self.shift = polar(
-            torch.ones((), dtype=torch.float64),
+            torch.ones((), dtype=torch.float64, device=device),
             turn * offset * torch.arange(self.length, device=device).double(),
         )
         both = torch.where((self.lags == 0) | (2 * self.lags == self.length), 1.0, 2.0)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
-from nlos_lit.functional.march import VoxelLattice, brick_maximum, constants, sample_unit, unit_scale
+from nlos_lit.functional.march import VoxelLattice, brick_maximum, constants, sample_unit, unit_scale, y_first
 
 BLOCK = 16  # neighbouring samples of a ray that are taken or left together
 
@@ -136,10 +136,9 @@ def static_march(
     chosen, used, needed_blocks = compact(occupied.view(-1), capacity.blocks)
     line, block = chosen // blocks, chosen % blocks
     scale, shift = unit_scale(lattice)
-    turned = [1, 0, 2]
     unit_origin, unit_world = (
-        ((origins - lattice.origin) * scale + shift)[:, turned],
-        (world * scale)[..., turned].reshape(-1, 3),
+        y_first((origins - lattice.origin) * scale + shift),
+        y_first(world * scale).reshape(-1, 3),
     )
     number = (block * BLOCK)[:, None] + torch.arange(BLOCK, device=volume.device)
     distance = (first[line][:, None] + number + 0.5) * step

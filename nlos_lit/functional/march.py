@@ -133,7 +133,7 @@ def sample(volume: Tensor, points: Tensor, lattice: VoxelLattice) -> Tensor:
             [(flat[index] * weight).sum(1) for index, weight in (corner_weights(p, lattice) for p in parts)]
         )
     scale, shift = unit_scale(lattice)
-    return sample_unit(volume, ((points - lattice.origin) * scale + shift)[:, [1, 0, 2]])
+    return sample_unit(volume, y_first((points - lattice.origin) * scale + shift))
 
 
 def unit_scale(lattice: VoxelLattice) -> tuple[Tensor, Tensor]:
@@ -141,6 +141,19 @@ def unit_scale(lattice: VoxelLattice) -> tuple[Tensor, Tensor]:
     sizes = (lattice.shape[1], lattice.shape[2], lattice.shape[0])
     cells = constants([max(n - 1, 1) for n in sizes], lattice.pitch)
     return 2 / (lattice.pitch * cells), constants([-1.0 if n > 1 else 0.0 for n in sizes], lattice.pitch)
+
+
+def y_first(vectors: Tensor) -> Tensor:
+    """The order of :func:`sample_unit`; for a list as an index, copied to the device, the host would wait.
+
+    Args:
+        vectors: ``[..., (x, y, z)]``.
+
+    Returns:
+        ``[..., (y, x, z)]``.
+    """
+    x, y, z = vectors.split(1, dim=-1)
+    return torch.cat([y, x, z], dim=-1)
 
 
 def constants(values: Sequence[float], like: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from nlos_lit.model.renderer import TransientRenderer
 
 FWHM = 2 * math.sqrt(2 * math.log(2))  # full width at half maximum of a unit Gaussian
 SPEED_M_PER_PS = 299_792_458e-12
+BRIGHT = 0.999999  # just below 1, so that single hot bins do not set the scale
 
 
 @dataclass(frozen=True)
@@ -161,12 +162,11 @@ def build_pipeline(capture: Capture, grid: VolumeGrid, settings: PipelineSetting
     return Pipeline(capture, phasor, geometry, albedo, renderer, laser_sensor)
 
 
-def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
-    """Counts that the loss counts as 1: a quantile of the gated bins that were recorded.
+def normalisation(capture: Capture) -> float:
+    """Counts that the loss counts as 1: the ``BRIGHT`` quantile of the gated bins that were recorded.
 
     Args:
         capture: what is fitted.
-        quantile: 0 … 1; just below 1, so that single hot bins do not set the scale.
 
     Returns:
         Counts a bin, above 0.
@@ -176,8 +176,11 @@ def normalisation(capture: Capture, quantile: float = 0.999999) -> float:
     """
     values, observed = capture.gated_counts(), capture.gated_observed()
     values = values.reshape(-1) if observed is None else values[observed]
-    rank = min(values.size - 1, int(quantile * values.size))
-    scale = float(np.partition(values, rank)[rank])
+    above = values.size - min(values.size - 1, int(BRIGHT * values.size))
+    peaks = np.maximum.reduceat(values, np.arange(0, values.size, 1024))
+    if above < len(peaks):  # what lies below that many peaks is not among that many bins either
+        values = values[values >= np.partition(peaks, -above)[-above]]
+    scale = float(np.partition(values, -above)[-above])
     if scale == 0:
         first, last = capture.gate
         raise UserError(

@@ -171,9 +171,9 @@ def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray,
     parts: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(spots), block):
         index = torch.from_numpy(spots[first : first + block]).to(module.device)
-        surface = pipeline.surface(volume, origins[index], normals[index])
-        values = trilinear(albedo, surface.point, pipeline.geometry.lattice)
-        parts.append(
-            tuple(t.cpu().numpy().astype(np.float64) for t in (surface.point, surface.normal, values))
-        )
+        surface = pipeline.geometry(volume, origins[index], normals[index])
+        met = surface.normal.any(1)  # off the CPU there are rows to spare, without a normal
+        point, normal = surface.point[met], surface.normal[met]
+        values = trilinear(albedo, point, pipeline.geometry.lattice)
+        parts.append(tuple(t.cpu().numpy().astype(np.float64) for t in (point, normal, values)))
     return Points(*(np.concatenate(column) for column in zip(*parts, strict=True)))

@@ -4,13 +4,17 @@ the host.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import literal
+import numpy as np
 import pytest
 import torch
 from literal_scenes import CASES, NAMES, build
 
 from nlos_lit.functional.fixed_size_march import compact
 from nlos_lit.model.objective import Objective, rated_groups
+from nlos_lit.training.shown import surface_points
 
 RATES = {"phasor": 0.05, "sensor": 0.1, "albedo": 0.3}
 CRITERION = Objective(400.0, 0.01, 0.005, albedo_planes=5, seed=3)
@@ -58,6 +62,20 @@ def test_fixed_sizes_change_nothing(name):
         assert found[key].item() == pytest.approx(value.item(), rel=1e-5)
     for mine, gradient in zip(static_gradients, gradients, strict=True):
         assert literal.relative(mine, gradient) < 1e-4
+
+
+@pytest.mark.parametrize("name", ["fine", "one sensor"])
+def test_points_that_are_shown_are_the_same(name):
+    """Rows to spare have no normal and are not points; one sensor's surface is shown from the laser's."""
+    made, shown = world(name), {}
+    for static in (False, True):
+        made.pipeline.geometry.wants_static = static
+        module = SimpleNamespace(pipeline=made.pipeline, device=torch.device("cpu"))
+        points = surface_points(module, made.capture, np.arange(made.capture.n_spots), block=4)
+        rows = np.column_stack([points.positions, points.normals, points.albedo])
+        shown[static] = rows[np.lexsort(np.round(rows[:, :3], 4).T)]
+    assert len(shown[True]) == len(shown[False]) > 50
+    assert np.allclose(shown[True], shown[False], atol=1e-5)
 
 
 def test_too_little_room_is_noticed_and_made():

@@ -38,6 +38,17 @@ def test_bins_that_were_not_recorded_count_neither_at_the_start_nor_in_the_loss(
     assert found["whole"][2] == pytest.approx(9)
 
 
+@pytest.mark.parametrize(("bins", "level"), [(100, 3.0), (300_000, 0.01), (300_000, 30.0)])
+def test_the_scale_is_that_of_sorted_bins(bins, level):
+    """Of few bins and of many, where most are zero and where all differ; one hot bin sets it in the first."""
+    counts = np.random.default_rng(bins).poisson(level, (12, bins)).astype(np.float32)
+    counts[5, 70] = 1e5
+    values = np.sort(counts.ravel())
+    scale = normalisation(Capture(**fields(counts=counts, bin_length=1e-4)))
+    assert scale == values[min(values.size - 1, int(0.999999 * values.size))]
+    assert (scale == 1e5) == (bins == 100)
+
+
 def test_a_gate_without_photons_is_refused():
     counts = np.arange(120).reshape(12, 10)
     counts[:, 5:] = 0
