@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import lightning as L
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 
@@ -16,6 +17,7 @@ from nlos_lit.report.style import save_figure
 from nlos_lit.runtime.progress import Ticker
 from nlos_lit.training.capture_fit import CaptureFit
 from nlos_lit.training.explored import LIVE_SPOTS, SPOTS, facts_of, keep, view_of
+from nlos_lit.training.pace import Pace
 from nlos_lit.training.shown import shown_spots
 
 
@@ -38,6 +40,41 @@ class WholeCheckpoints(TorchCheckpointIO):
             storage_options: not looked at.
         """
         write_tensors(path, checkpoint)
+
+
+class Checkpoint(ModelCheckpoint):
+    """The fit as it stands; ``last.ckpt`` is a link to the latest.
+
+    Args:
+        dirpath: folder of the files.
+        filename: of a checkpoint, as Lightning's class takes it.
+        save_top_k: how many are kept, -1 for all.
+        every: iterations between checkpoints; None goes by the time that they take, see
+            :class:`~nlos_lit.training.pace.Pace`.
+    """
+
+    def __init__(self, dirpath: str | Path, filename: str, save_top_k: int, every: int | None) -> None:
+        super().__init__(
+            dirpath=dirpath,
+            filename=filename,
+            save_top_k=save_top_k,
+            save_last="link",
+            enable_version_counter=False,  # never last-v1.ckpt: there is one run in a folder, and one last
+            every_n_epochs=1,
+            save_on_train_epoch_end=True,  # not only where the held-out spots are scored
+        )
+        self.pace = Pace(every)
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Start the clock."""
+        super().on_train_start(trainer, module)
+        self.pace.start()
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Write the checkpoint where it is due."""
+        if self.pace.due(trainer, trainer.current_epoch + 1):
+            with self.pace.taking():
+                super().on_train_epoch_end(trainer, module)
 
 
 class ScoreHeldout(L.Callback):
@@ -173,12 +210,13 @@ class Figures(L.Callback):
     That folder is below the trainer's ``default_root_dir``.
 
     Args:
-        every: iterations between figures; also before the first and after the last.
         transients: spots whose transients are shown, spread over the scan.
+        every: iterations between figures, None goes by the time that they take; also before the first
+            iteration and after the last.
     """
 
-    def __init__(self, every: int, transients: int) -> None:
-        self.every, self.transients = every, transients
+    def __init__(self, transients: int, every: int | None) -> None:
+        self.pace, self.transients = Pace(every), transients
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show what the fit starts from."""
@@ -189,18 +227,21 @@ class Figures(L.Callback):
             for name, figure in module.first_figures().items():
                 save_figure(figure, Path(trainer.default_root_dir) / "figures" / f"{name}.png")
         module.release()
+        self.pace.start()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Show the state after every ``every`` iterations and after the last."""
+        """Show the state where that is due and after the last iteration."""
         module, step = cast(CaptureFit, module), trainer.current_epoch + 1
-        if step % self.every == 0 or step == module.planned:
+        if self.pace.due(trainer, step) or step == module.planned:
             module.hold()
             self._show(trainer, module)
             module.release()
 
     def _show(self, trainer: L.Trainer, module: CaptureFit) -> None:
         boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-        if trainer.is_global_zero and boards:
+        if not (trainer.is_global_zero and boards):
+            return
+        with self.pace.taking():
             capture = _data(trainer).capture
             for name, figure in module.figures(
                 capture, shown_spots(capture.n_spots, self.transients)
@@ -213,34 +254,40 @@ class Explore(L.Callback):
     """The page ``explore.html`` of a run while it goes on, see :mod:`nlos_lit.training.explored`.
 
     Args:
-        every: iterations between pages; the first is made before the first iteration.
+        every: iterations between pages, None goes by the time that they take; the first is made before the
+            first iteration.
     """
 
-    def __init__(self, every: int) -> None:
-        self.every = every
+    def __init__(self, every: int | None) -> None:
+        self.pace = Pace(every)
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show what the fit starts from."""
         self._keep(trainer, cast(CaptureFit, module), trainer.current_epoch)
+        self.pace.start()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Show the state after every ``every`` iterations; the last is shown by the command itself."""
+        """Show the state where that is due; the last is shown by the command itself."""
         module, step = cast(CaptureFit, module), trainer.current_epoch + 1
-        if step % self.every == 0 and step != module.planned:
+        if self.pace.due(trainer, step) and step != module.planned:
             self._keep(trainer, module, step)
 
     def _keep(self, trainer: L.Trainer, module: CaptureFit, step: int) -> None:
         module.hold()
         if trainer.is_global_zero:
-            capture, error = _data(trainer).capture, trainer.callback_metrics.get("heldout/nmse")
-            said = f"{module.what}: {step} of {module.planned}"
-            said += "" if error is None else f", held-out NMSE {float(error):.4f}"
-            folder = Path(trainer.default_root_dir)
-            folder = folder.parent if folder.name == "refined" else folder
-            models, scene = module.explored()
-            kept = module.origin.get("settings", {})
-            settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
-            facts = facts_of(settings, capture, "running", [said])
-            spots = SPOTS if scene.volume is None else LIVE_SPOTS
-            keep(folder, view_of(capture, models, scene, facts, spots))
+            with self.pace.taking():
+                self._page(trainer, module, step)
         module.release()
+
+    def _page(self, trainer: L.Trainer, module: CaptureFit, step: int) -> None:
+        capture, error = _data(trainer).capture, trainer.callback_metrics.get("heldout/nmse")
+        said = f"{module.what}: {step} of {module.planned}"
+        said += "" if error is None else f", held-out NMSE {float(error):.4f}"
+        folder = Path(trainer.default_root_dir)
+        folder = folder.parent if folder.name == "refined" else folder
+        models, scene = module.explored()
+        kept = module.origin.get("settings", {})
+        settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
+        facts = facts_of(settings, capture, "running", [said])
+        spots = SPOTS if scene.volume is None else LIVE_SPOTS
+        keep(folder, view_of(capture, models, scene, facts, spots))

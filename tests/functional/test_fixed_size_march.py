@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from literal_scenes import CASES, NAMES, build
+from pretended_device import DEVICE, pretended
 
 from nlos_lit.functional.fixed_size_march import compact
 from nlos_lit.model.objective import Objective, rated_groups
@@ -93,37 +94,51 @@ def test_too_little_room_is_noticed_and_made():
     assert not geometry.renew_capacity()
 
 
-def test_an_iteration_needs_no_value_on_the_host(monkeypatch):
-    """On the meta device tensors have no values: whatever waits for one fails, and so does a copy of numbers
-    from the host.
-    """
-    made = world("fine")
-    made.pipeline.geometry.wants_static = True
-    loss_and_gradients(made)  # finds the capacity
-    pipeline = made.pipeline.to("meta")
-    optimiser = torch.optim.Adam(rated_groups(pipeline, RATES, list(RATES)))
-    made_on_host = torch.tensor
+def iterations(made, number: int) -> tuple[list[float], list[list[str]]]:
+    """The loss of each, and for what each made the host wait; before, the field is made on its device."""
+    phasor = made.pipeline.phasor
+    device, losses, waited = phasor.omega_pf.raw.device, [], []
+    with pretended() as waits:
+        phasor.prepare(made.capture, phasor.plan(made.capture, 1 << 32))
+        optimiser = torch.optim.Adam(rated_groups(made.pipeline, RATES, list(RATES)))
+        spots, counts = made.spots.to(device), made.counts.to(device)
+        for step in range(number):
+            waits.clear()
+            optimiser.zero_grad()
+            loss = CRITERION.terms(made.pipeline, spots, counts, step)["loss"]
+            loss.backward()
+            optimiser.step()
+            waited.append(list(waits))
+            losses.append(loss.item())
+    return losses, waited
 
-    def refuse(data, *args, device=None, **kwargs):
-        assert device is None or torch.device(device).type == "cpu", (
-            "numbers copied from the host in an iteration"
-        )
-        return made_on_host(data, *args, device=device, **kwargs)
 
-    monkeypatch.setattr(torch, "tensor", refuse)
-    monkeypatch.setattr(
-        torch.Tensor, "new_tensor", lambda *_: pytest.fail("numbers copied from the host in an iteration")
-    )
-    for step in range(2):
-        optimiser.zero_grad()
-        CRITERION.terms(pipeline, made.spots.to("meta"), made.counts.to("meta"), step)["loss"].backward()
-        optimiser.step()
-    assert pipeline.phasor.omega_pf.raw.grad.device.type == "meta"
+@pytest.mark.parametrize("name", ["fine", "one sensor"])
+def test_an_iteration_on_a_device_needs_no_value_on_the_host(name):
+    """And its losses are those of the CPU."""
+    expected, _ = iterations(world(name), 3)
+    made = world(name)
+    with pretended():
+        made.pipeline.to(DEVICE)
+    losses, waited = iterations(made, 3)
+    assert waited[0] == ["aten._local_scalar_dense.default", "tolist"]  # how much room is needed
+    assert waited[1:] == [[], []]
+    assert losses == pytest.approx(expected, rel=1e-4)
 
 
 def test_the_other_march_would_wait():
     """The check above can fail: the march with sizes of its own needs values."""
     made = world("fine")
     made.pipeline.geometry.wants_static = False
-    with pytest.raises((NotImplementedError, RuntimeError), match="Meta tensors"):
-        CRITERION.terms(made.pipeline.to("meta"), made.spots.to("meta"), made.counts.to("meta"), 0)
+    with pretended():
+        made.pipeline.to(DEVICE)
+    _, waited = iterations(made, 2)
+    assert "aten.nonzero.default" in waited[1]
+
+
+def test_a_tensor_left_behind_is_refused():
+    with pretended():
+        there = torch.ones(3, device=DEVICE)
+        with pytest.raises(AssertionError, match=r"aten.add.Tensor: tensors \[\(3,\)\] lie on the CPU"):
+            there + torch.ones(3)
+        assert (there + 1).cpu().tolist() == [2, 2, 2]

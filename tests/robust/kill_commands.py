@@ -39,7 +39,7 @@ SCENE = [
 ]  # fmt: skip
 TRAIN = [
     *SCENE, "scene.iterations=12", "model.rays=40", "batch_spots=8", "heldout.block=3",
-    "heldout.monitor_spots=16", "export.spots=16", "logger=none", "callbacks.checkpoint.every_n_epochs=2",
+    "heldout.monitor_spots=16", "export.spots=16", "logger=none", "callbacks.checkpoint.every=2",
 ]  # fmt: skip
 SURFACE = ["surfels.contest=10", "surfels.rounds=2", "surfels.steps=20", "surfels.more=0"]
 CRITICISM = ["criticism.spots=36", "criticism.rivals=1", "criticism.most=1"]

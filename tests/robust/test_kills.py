@@ -16,7 +16,7 @@ SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12", "scene.volume.depth=[0.4,0.95]",
     "scene.volume.depth_pitch=0.0192", "scene.iterations=30", "model.rays=40", "batch_spots=8",
     "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16", "threads=1", "logger=none",
-    "callbacks.checkpoint.every_n_epochs=2", "refine=true", "surfels.contest=20", "surfels.rounds=2",
+    "callbacks.checkpoint.every=2", "refine=true", "surfels.contest=20", "surfels.rounds=2",
     "surfels.steps=60", "surfels.more=0",
 ]  # fmt: skip
 KILLS = 12

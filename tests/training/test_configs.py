@@ -301,11 +301,11 @@ def test_a_trainer_as_the_config_says(tmp_path):
         "ProgressBar",
         "Figures",
         "Explore",
-        "ModelCheckpoint",
+        "Checkpoint",
     ]
     checkpoint = trainer.callbacks[-1]
-    assert (checkpoint.dirpath, checkpoint.filename) == (str(tmp_path / "checkpoints"), "iteration")
-    assert (checkpoint.save_last, checkpoint._every_n_epochs) == (True, 10)
+    assert checkpoint.dirpath == str(tmp_path / "checkpoints")
+    assert (checkpoint.filename, checkpoint.save_top_k, checkpoint.pace.every) == ("iteration", 1, None)
     assert checkpoint._save_on_train_epoch_end is True
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"]
     assert make_trainer(composed("logger=none", "trainer.max_epochs=3")).loggers == []

@@ -30,7 +30,7 @@ from nlos_lit.training.run_folder import find_checkpoint, open_run, prepare_run
 SMALL = [
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.03", "model.rays=20", "batch_spots=8",
     "heldout.block=3", "heldout.monitor_spots=8", "logger=none", "~callbacks.figures", "scene=capture",
-    "scene.sum_bins=1",    "callbacks.checkpoint.every_n_epochs=1", "scene.iterations=2",
+    "scene.sum_bins=1",    "callbacks.checkpoint.every=1", "scene.iterations=2",
 ]  # fmt: skip
 
 

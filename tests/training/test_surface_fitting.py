@@ -13,20 +13,21 @@ import numpy as np
 import pytest
 import torch
 from forked import command
-from lightning.pytorch.callbacks import ModelCheckpoint
+from pretended_device import DEVICE, pretended
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.commands.train import surface_settings
 from nlos_lit.effects.strengths import bound_notes
+from nlos_lit.functional.compiled import tensor_by_tensor
 from nlos_lit.io.points import read_points
 from nlos_lit.metrics.excess import Excess
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.runtime.command_line import quiet_libraries
 from nlos_lit.surfels.fit import score_spots
 from nlos_lit.surfels.fitted import fitted_surfels
-from nlos_lit.training.callbacks import History, ScoreHeldout
+from nlos_lit.training.callbacks import Checkpoint, History, ScoreHeldout
 from nlos_lit.training.configs import compose
 from nlos_lit.training.origin import START, finished_checkpoint
 from nlos_lit.training.run_folder import Run, open_run, prepare_run
@@ -37,7 +38,7 @@ SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
-    "trainer.check_val_every_n_epoch=5", "callbacks.checkpoint.every_n_epochs=1",
+    "trainer.check_val_every_n_epoch=5", "callbacks.checkpoint.every=1",
     "callbacks.figures.every=20", "surfels.contest=4", "surfels.rounds=2", "surfels.steps=8",
     "surfels.outlines=1", "surfels.more=1", "export.transients=2", "threads=1",
 ]  # fmt: skip
@@ -74,7 +75,7 @@ def trainer_of(folder: Path, epochs: int = -1) -> L.Trainer:
         callbacks=[
             ScoreHeldout(),
             History(),
-            ModelCheckpoint(folder, save_last=True, every_n_epochs=1, save_on_train_epoch_end=True),
+            Checkpoint(folder, "iteration", 1, every=1),
         ],
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -123,6 +124,23 @@ def test_a_trainer_takes_the_same_steps_stopped_or_not(run, tmp_path):
     assert trainer.callbacks[1].ran == 0
     assert same(again.fit.state(), by_hand.fit.state())
     assert again.scores == whole.scores
+
+
+def test_a_fit_on_a_device_is_that_of_the_cpu(run):
+    """From the contest to the end of the first round; later rounds turn on last digits."""
+    here, there = seeded(run).fit, seeded(run).fit
+    with pretended(), tensor_by_tensor():
+        there.to(DEVICE)
+        for fit in (here, there):
+            while len(fit.history) < 2:
+                if not fit.in_round:
+                    fit.begin_round()
+                fit.step()
+                if fit.round_done:
+                    fit.end_round()
+    assert len(here.model) == len(there.model) > 50
+    for mine, other in zip(here.history, there.history, strict=True):
+        assert mine == pytest.approx(other, rel=1e-3)
 
 
 def test_a_checkpoint_of_other_effects_or_of_no_surface_is_refused(run, tmp_path):

@@ -31,7 +31,7 @@ SMALL = [
     "scene.simulate.scan.nx=12", "scene.simulate.scan.ny=12",
     "scene.volume.depth=[0.4,0.95]", "scene.volume.depth_pitch=0.0192",
     "model.rays=40", "batch_spots=8", "heldout.block=3", "heldout.monitor_spots=16", "export.spots=16",
-    "trainer.check_val_every_n_epoch=2", "callbacks.checkpoint.every_n_epochs=1", "callbacks.figures.every=5",
+    "trainer.check_val_every_n_epoch=2", "callbacks.checkpoint.every=1", "callbacks.figures.every=5",
     "export.transients=2", "threads=1",
 ]  # fmt: skip
 
@@ -55,7 +55,7 @@ def state(folder: Path, name: str = "last") -> dict:
     return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-EACH = ("+callbacks.checkpoint.save_top_k=-1", "callbacks.checkpoint.filename='{epoch}'")  # is kept
+EACH = ("callbacks.checkpoint.save_top_k=-1", "callbacks.checkpoint.filename='{epoch}'")  # is kept
 
 
 @pytest.fixture(scope="module")
