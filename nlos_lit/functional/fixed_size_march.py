@@ -17,6 +17,7 @@ from torch.nn.functional import max_pool3d
 from nlos_lit.functional.march import VoxelLattice, brick_maximum, constants, sample_unit, unit_scale, y_first
 
 BLOCK = 16  # neighbouring samples of a ray that are taken or left together
+AT_ONCE = 1 << 20  # blocks whose points are in memory together: a sample's take some 100 bytes on the way
 
 
 class Capacity(NamedTuple):
@@ -115,22 +116,21 @@ def static_march(
         for s, p in zip(size, (pitch[2], pitch[0], pitch[1]), strict=True)
     ]
     bricks = (brick_maximum(volume, size) >= threshold).to(torch.float32)
-    near_bricks = max_pool3d(bricks, [2 * r + 1 for r in reach], stride=1, padding=reach)[0, 0]
+    near_bricks = max_pool3d(bricks, [2 * r + 1 for r in reach], stride=1, padding=reach)[0, 0] > 0
 
     begin = torch.arange(blocks, device=volume.device) * BLOCK
     middle = (first[:, None] + begin + BLOCK / 2) * step  # [S·n², blocks]
-    index = []
-    for axis, (s, cells) in enumerate(
-        zip((size[1], size[2], size[0]), (*near_bricks.shape[1:], near_bricks.shape[0]), strict=True)
-    ):
+    sizes, cells = (wide, high, deep), (*near_bricks.shape[1:], near_bricks.shape[0])
+    brick = torch.zeros((), dtype=torch.int32, device=volume.device)
+    for axis in (2, 0, 1):  # as bricks lie in memory
         at = (
             origins[:, None, None, axis]
             - lattice.origin[axis]
             + middle.view(spots, rays, -1) * world[..., axis, None]
         ) / lattice.pitch[axis]
-        index.append((at / s).floor().clamp(0, cells - 1).long().view(-1, blocks))
-    flat = (index[2] * near_bricks.shape[1] + index[0]) * near_bricks.shape[2] + index[1]
-    occupied = (near_bricks.reshape(-1)[flat] > 0) & (begin < count[:, None])
+        along = (at / sizes[axis]).floor().clamp(0, cells[axis] - 1)
+        brick = brick * cells[axis] + along.to(torch.int32).view(-1, blocks)
+    occupied = near_bricks.reshape(-1)[brick] & (begin < count[:, None])
     if capacity is None:
         capacity = _measured(occupied)
     chosen, used, needed_blocks = compact(occupied.view(-1), capacity.blocks)
@@ -142,8 +142,15 @@ def static_march(
     )
     number = (block * BLOCK)[:, None] + torch.arange(BLOCK, device=volume.device)
     distance = (first[line][:, None] + number + 0.5) * step
-    points = unit_origin[line // rays][:, None] + distance[..., None] * unit_world[line][:, None]
-    value = sample_unit(volume, points.view(-1, 3)).view(-1, BLOCK)
+    value = torch.cat(
+        [
+            sample_unit(
+                volume,
+                (unit_origin[some // rays][:, None] + far[..., None] * unit_world[some][:, None]).view(-1, 3),
+            )
+            for some, far in zip(line.split(AT_ONCE), distance.split(AT_ONCE), strict=True)
+        ]
+    ).view(-1, BLOCK)
     value = torch.where((number < count[line][:, None]) & used[:, None] & (value >= threshold), value, -1.0)
     peak = torch.full((spots * rays,), -1.0, device=volume.device, dtype=value.dtype).scatter_reduce(
         0, line, value.amax(1), "amax"
