@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import lightning as L
-from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch import callbacks
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins import TorchCheckpointIO
 
@@ -42,39 +42,32 @@ class WholeCheckpoints(TorchCheckpointIO):
         write_tensors(path, checkpoint)
 
 
-class Checkpoint(ModelCheckpoint):
-    """The fit as it stands; ``last.ckpt`` is a link to the latest.
+class Checkpoint(callbacks.Checkpoint):
+    """The fit as it stands, in ``last.ckpt``.
 
     Args:
-        dirpath: folder of the files.
-        filename: of a checkpoint, as Lightning's class takes it.
-        save_top_k: how many are kept, -1 for all.
+        dirpath: folder of the file.
+        each: whether one for each iteration is kept as well, ``epoch=N.ckpt``.
         every: iterations between checkpoints; None goes by the time that they take, see
             :class:`~nlos_lit.training.pace.Pace`.
     """
 
-    def __init__(self, dirpath: str | Path, filename: str, save_top_k: int, every: int | None) -> None:
-        super().__init__(
-            dirpath=dirpath,
-            filename=filename,
-            save_top_k=save_top_k,
-            save_last="link",
-            enable_version_counter=False,  # never last-v1.ckpt: there is one run in a folder, and one last
-            every_n_epochs=1,
-            save_on_train_epoch_end=True,  # not only where the held-out spots are scored
-        )
-        self.pace = Pace(every)
+    def __init__(self, dirpath: str | Path, each: bool, every: int | None) -> None:
+        self.folder, self.each, self.pace = Path(dirpath), each, Pace(every)
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Start the clock."""
-        super().on_train_start(trainer, module)
         self.pace.start()
 
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Write the checkpoint where it is due."""
-        if self.pace.due(trainer, trainer.current_epoch + 1):
-            with self.pace.taking():
-                super().on_train_epoch_end(trainer, module)
+        """Write the checkpoint where it is due; Lightning calls this after all other callbacks'."""
+        trial = trainer.fast_dev_run  # type: ignore[attr-defined]  # set by Lightning, not declared
+        if trial or not self.pace.due(trainer, trainer.current_epoch + 1):
+            return
+        with self.pace.taking():
+            if self.each:
+                trainer.save_checkpoint(self.folder / f"epoch={trainer.current_epoch}.ckpt")
+            trainer.save_checkpoint(self.folder / "last.ckpt")
 
 
 class ScoreHeldout(L.Callback):

@@ -104,7 +104,7 @@ def write_surface(run: Run, module: SurfaceFitting, place: Path, began: float) -
     seen = front(found.model)
     write_depth(place / "depth.npy", seen.depth)
     mesh = write_mesh(place / "mesh.ply", points, depth=export["mesh_depth"])
-    write_tensors(place / "surfels.pt", found.model.state_dict())
+    write_tensors(place / "surfels.pt", found.model.state_dict(), deflate=True)
     names = [effect.name for effect in found.extension.effects]
     write_tensors(place / "effects.pt", {"names": names, "state": found.extension.state_dict()})
     spots = shown_spots(capture.n_spots, export["transients"])
@@ -221,6 +221,6 @@ def load_refined(folder: str | Path, capture: Capture) -> tuple[SurfelModel, Ext
         extension = Extension(build_effects(saved["names"], Scan.of(capture)))
         extension.load_state_dict(saved["state"])
     with sound(place / "surfels.pt"):
-        state = torch.load(archived(place / "surfels.pt"), map_location="cpu", weights_only=True)
+        state = torch.load(archived(place / "surfels.pt", packed=True), map_location="cpu", weights_only=True)
         model = SurfelModel.from_state(capture, state)
     return model, extension

@@ -304,9 +304,8 @@ def test_a_trainer_as_the_config_says(tmp_path):
         "Checkpoint",
     ]
     checkpoint = trainer.callbacks[-1]
-    assert checkpoint.dirpath == str(tmp_path / "checkpoints")
-    assert (checkpoint.filename, checkpoint.save_top_k, checkpoint.pace.every) == ("iteration", 1, None)
-    assert checkpoint._save_on_train_epoch_end is True
+    assert (checkpoint.folder, checkpoint.each) == (tmp_path / "checkpoints", False)
+    assert checkpoint.pace.every is None
     assert [type(logger).__name__ for logger in trainer.loggers] == ["CSVLogger"]
     assert make_trainer(composed("logger=none", "trainer.max_epochs=3")).loggers == []
     both = make_trainer(composed("trainer.precision=64-true", "+trainer.max_time=00:01:00:00"))

@@ -75,7 +75,7 @@ def trainer_of(folder: Path, epochs: int = -1) -> L.Trainer:
         callbacks=[
             ScoreHeldout(),
             History(),
-            Checkpoint(folder, "iteration", 1, every=1),
+            Checkpoint(folder, each=False, every=1),
         ],
         enable_progress_bar=False,
         enable_model_summary=False,

@@ -55,7 +55,7 @@ def state(folder: Path, name: str = "last") -> dict:
     return torch.load(folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
 
 
-EACH = ("callbacks.checkpoint.save_top_k=-1", "callbacks.checkpoint.filename='{epoch}'")  # is kept
+EACH = "callbacks.checkpoint.each=true"
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +68,7 @@ def finished(tmp_path_factory) -> Path:
         "surfels.steps=16",
         "surfels.contest=8",
         "surfels.more=0",
-        *EACH,
+        EACH,
         folder=folder,
     )
     return folder
@@ -202,14 +202,14 @@ def test_a_finished_folder_is_not_overwritten(finished):
 
 CTRL_C = """
 import os, runpy, signal
-from lightning.pytorch.callbacks import ModelCheckpoint
+from nlos_lit.training.callbacks import Checkpoint
 
 def press(self, trainer, module):
     if trainer.current_epoch == 3:
         os.kill(os.getpid(), signal.SIGINT)
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in the background inherit that it is ignored
-ModelCheckpoint.on_train_epoch_start = press
+Checkpoint.on_train_epoch_start = press
 runpy.run_path("train.py", run_name="__main__")
 """
 
@@ -247,7 +247,7 @@ def test_two_processes_give_the_single_process_result(finished, tmp_path):
     """One iteration agrees to rounding. Later a ray's largest sample may flip between two near ties, so six
     agree to 1 %.
     """
-    done = train("scene.iterations=6", "logger=none", "trainer=ddp", *EACH, folder=tmp_path)
+    done = train("scene.iterations=6", "logger=none", "trainer=ddp", EACH, folder=tmp_path)
     assert "in each of 2 processes" not in done.stdout + done.stderr  # the field is whole
     for iterations, tolerance in ((1, 1e-6), (6, 1e-2)):
         alone, together = (state(folder, f"epoch={iterations - 1}") for folder in (finished, tmp_path))
