@@ -354,8 +354,8 @@ class Loop:
         is built anew with all that stay, who are asked again. Those that hold so are asked once more, beside
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
         however little they are asked for: what they explain would stand against all others as misfit. But
-        where one lacks only what others take, those that are missed least leave, one after the other: they
-        share what one of them may do.
+        where one lacks only what others take, those that are missed least leave, one after the other, as they
+        may share what one of them does. If that leaves no more names than there were, they stay.
 
         Args:
             members: whose terms the scene has.
@@ -369,13 +369,20 @@ class Loop:
             with those that stay.
         """
         staying, left = list(members), dict[str, Member]()
+        whole: tuple[list[Member], dict[str, Member], SurfelFit, SurfelFit | None] | None = None
+        apart = True  # look-alikes may leave
         while staying:
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
             gone = _leaving(staying, enough)
+            if not gone and apart and (gone := _sharing(staying)) and whole is None:
+                whole = staying, dict(left), scene, coarse
             if not gone and coarse is not None:
                 staying = self._anew(staying, coarse, scene)
                 gone = _leaving(staying, enough)
+            if whole is not None and _named(staying) < _named(whole[0]) + (not gone):
+                (staying, left, scene, coarse), whole, apart = whole, None, False
+                continue
             if not gone:
                 break
             left |= {m.name: replace(m, gone=True) for m in gone}
@@ -856,10 +863,17 @@ def criticise(
 def _leaving(members: list[Member], enough: list[str]) -> list[Member]:
     """Who of some members that were asked leaves; ``enough`` would have enough without the others."""
     failing = [m for m in members if not m.stays]
-    if failing:
-        return [m for m in failing if m.name not in enough] or [min(failing, key=_gain)]
+    return [m for m in failing if m.name not in enough] or sorted(failing, key=_gain)[:1]
+
+
+def _sharing(members: list[Member]) -> list[Member]:
+    """Who of some members that all stay leaves, where one lacks only what others take."""
     unnamed = [m for m in members if not m.accepted]
     return sorted(unnamed, key=_gain)[:1] if any(m.stands_in for m in unnamed) else []
+
+
+def _named(members: list[Member]) -> int:
+    return sum(m.accepted for m in members)
 
 
 def _gain(member: Member) -> float:
