@@ -355,7 +355,7 @@ class Loop:
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
         however little they are asked for: what they explain would stand against all others as misfit. But
         where one lacks only what others take, those that are missed least leave, one after the other, as they
-        may share what one of them does. If that leaves no more names than there were, they stay.
+        may share what one of them does. If fewer hold then than before, they stay.
 
         Args:
             members: whose terms the scene has.
@@ -380,7 +380,7 @@ class Loop:
             if not gone and coarse is not None:
                 staying = self._anew(staying, coarse, scene)
                 gone = _leaving(staying, enough)
-            if whole is not None and _named(staying) < _named(whole[0]) + (not gone):
+            if whole is not None and _named(staying) < _named(whole[0]):
                 (staying, left, scene, coarse), whole, apart = whole, None, False
                 continue
             if not gone:
