@@ -187,6 +187,15 @@ class Held(NamedTuple):
     coarse: SurfelFit
 
 
+class Standing(NamedTuple):
+    """Where a search stands for those that hold."""
+
+    staying: list[Member]
+    gone: dict[str, Member]  # by name
+    scene: SurfelFit
+    coarse: SurfelFit | None  # as Loop.hold takes it
+
+
 class Loop:
     """All that is tried on one capture.
 
@@ -368,24 +377,40 @@ class Loop:
             The same members, accepted or not, with none and itself as trials where they are, and both scenes
             with those that stay.
         """
-        staying, left = list(members), dict[str, Member]()
-        whole: tuple[list[Member], dict[str, Member], SurfelFit, SurfelFit | None] | None = None
-        apart = True  # look-alikes may leave
+        start = Standing(list(members), {}, scene, coarse)
+        end, whole = self._left(start, before, apart=True)
+        if whole is not None and _named(end.staying) < _named(whole.staying):
+            together, _ = self._left(whole, before, apart=False)
+            end = together if _named(together.staying) > _named(end.staying) else end
+        now = {m.name: m for m in end.staying} | end.gone
+        return [now[m.name] for m in members], end.scene, end.coarse
+
+    def _left(self, now: Standing, before: Held | None, apart: bool) -> tuple[Standing, Standing | None]:
+        """Who is left when nobody has to leave any more.
+
+        Args:
+            now: who is there.
+            before: as for :meth:`hold`.
+            apart: look-alikes leave, too.
+
+        Returns:
+            That, and how it stood when the first look-alike left, if one did.
+        """
+        (staying, left, scene, coarse), whole = now, None
         while staying:
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            gone = _leaving(staying, enough)
-            if not gone and apart and (gone := _sharing(staying)) and whole is None:
-                whole = staying, dict(left), scene, coarse
-            if not gone and coarse is not None:
-                staying = self._anew(staying, coarse, scene)
+            for anew in (False, True):
+                if anew and coarse is not None:
+                    staying = self._anew(staying, coarse, scene)
                 gone = _leaving(staying, enough)
-            if whole is not None and _named(staying) < _named(whole[0]):
-                (staying, left, scene, coarse), whole, apart = whole, None, False
-                continue
-            if not gone:
+                if not gone and apart and (gone := _sharing(staying)):
+                    whole = whole or Standing(staying, left, scene, coarse)
+                if gone:
+                    break
+            else:
                 break
-            left |= {m.name: replace(m, gone=True) for m in gone}
+            left = left | {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
             if coarse is None or before is None:
                 scene = self._bare(scene, gone, asked)
@@ -395,8 +420,7 @@ class Loop:
                 names = [m.name for m in [*before.members, *staying]]
                 coarse = self.built_with(coarse, names)
                 scene = self.better(self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
-        now = {m.name: m for m in staying} | left
-        return [now[m.name] for m in members], scene, coarse
+        return Standing(staying, left, scene, coarse), whole
 
     def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """A parsimonious scene with some of its terms: gone on with, or built anew.
