@@ -215,7 +215,8 @@ class Figures(L.Callback):
         """Show what the fit starts from."""
         module = cast(CaptureFit, module)
         module.hold()
-        self._show(trainer, module)
+        with self.pace.taking():
+            self._show(trainer, module)
         if trainer.is_global_zero and trainer.current_epoch == 0:
             for name, figure in module.first_figures().items():
                 save_figure(figure, Path(trainer.default_root_dir) / "figures" / f"{name}.png")
@@ -225,16 +226,18 @@ class Figures(L.Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Show the state where that is due and after the last iteration."""
         module, step = cast(CaptureFit, module), trainer.current_epoch + 1
-        if self.pace.due(trainer, step) or step == module.planned:
-            module.hold()
-            self._show(trainer, module)
-            module.release()
+        if self._boards(trainer) and (self.pace.due(trainer, step) or step == module.planned):
+            with self.pace.taking():
+                module.hold()
+                self._show(trainer, module)
+                module.release()
+
+    def _boards(self, trainer: L.Trainer) -> list[TensorBoardLogger]:
+        return [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
 
     def _show(self, trainer: L.Trainer, module: CaptureFit) -> None:
-        boards = [logger for logger in trainer.loggers if isinstance(logger, TensorBoardLogger)]
-        if not (trainer.is_global_zero and boards):
-            return
-        with self.pace.taking():
+        boards = self._boards(trainer)
+        if trainer.is_global_zero and boards:
             capture = _data(trainer).capture
             for name, figure in module.figures(
                 capture, shown_spots(capture.n_spots, self.transients)
@@ -266,21 +269,18 @@ class Explore(L.Callback):
             self._keep(trainer, module, step)
 
     def _keep(self, trainer: L.Trainer, module: CaptureFit, step: int) -> None:
-        module.hold()
-        if trainer.is_global_zero:
-            with self.pace.taking():
-                self._page(trainer, module, step)
-        module.release()
-
-    def _page(self, trainer: L.Trainer, module: CaptureFit, step: int) -> None:
-        capture, error = _data(trainer).capture, trainer.callback_metrics.get("heldout/nmse")
-        said = f"{module.what}: {step} of {module.planned}"
-        said += "" if error is None else f", held-out NMSE {float(error):.4f}"
-        folder = Path(trainer.default_root_dir)
-        folder = folder.parent if folder.name == "refined" else folder
-        models, scene = module.explored()
-        kept = module.origin.get("settings", {})
-        settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
-        facts = facts_of(settings, capture, "running", [said])
-        spots = SPOTS if scene.volume is None else LIVE_SPOTS
-        keep(folder, view_of(capture, models, scene, facts, spots))
+        with self.pace.taking():
+            module.hold()
+            if trainer.is_global_zero:
+                capture, error = _data(trainer).capture, trainer.callback_metrics.get("heldout/nmse")
+                said = f"{module.what}: {step} of {module.planned}"
+                said += "" if error is None else f", held-out NMSE {float(error):.4f}"
+                folder = Path(trainer.default_root_dir)
+                folder = folder.parent if folder.name == "refined" else folder
+                models, scene = module.explored()
+                kept = module.origin.get("settings", {})
+                settings = {"name": kept.get("scene.name", "capture"), "path": kept.get("scene.path")}
+                facts = facts_of(settings, capture, "running", [said])
+                spots = SPOTS if scene.volume is None else LIVE_SPOTS
+                keep(folder, view_of(capture, models, scene, facts, spots))
+            module.release()

@@ -27,7 +27,7 @@ class Pace:
         if every is not None and every < 1:
             raise ValueError(f"every must be 1 iteration or more, or null; found {every}")
         self.every = every
-        self.began = self.before = time.perf_counter()
+        self.began = time.perf_counter()
         self.spent = self.last = 0.0
 
     def start(self) -> None:

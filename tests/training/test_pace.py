@@ -33,15 +33,7 @@ def record(pace: Pace, clock: Clock, seconds: float) -> None:
 
 def test_a_number_of_iterations_is_obeyed():
     pace = Pace(3)
-    assert [pace.due(alone(), step) for step in range(1, 8)] == [
-        False,
-        False,
-        True,
-        False,
-        False,
-        True,
-        False,
-    ]
+    assert [step for step in range(1, 8) if pace.due(alone(), step)] == [3, 6]
 
 
 @pytest.mark.parametrize("every", [0, -1])
