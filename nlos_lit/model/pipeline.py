@@ -104,11 +104,7 @@ class Pipeline(nn.Module):
             The surface, with ``spot`` an index into ``sensor``.
         """
         if self.geometry.static:  # without asking the device which points are equal
-            return (
-                self._from_one(intensity, sensor, normal)
-                if self.one_sensor
-                else self.geometry(intensity, sensor, normal)
-            )
+            return self.geometry(intensity, sensor, normal)
         places, which = torch.unique(torch.cat([sensor, normal], dim=1), dim=0, return_inverse=True)
         if len(places) == len(sensor):
             return self.geometry(intensity, sensor, normal)
@@ -138,7 +134,9 @@ class Pipeline(nn.Module):
             H_r ``[S, T]`` over bins 0 … gate's end, the surface, and its albedo ``[K]``.
         """
         laser, sensor = self.laser[spots], self.sensor[spots]
-        surface = self.surface(intensity, sensor, self.sensor_normal[spots])
+        known = self.one_sensor and self.geometry.static
+        look = self._from_one if known else self.surface
+        surface = look(intensity, sensor, self.sensor_normal[spots])
         surface_albedo = trilinear(albedo, surface.point, self.geometry.lattice)
         rendered = self.renderer(
             surface, surface_albedo, laser, self.laser_normal[spots], sensor, self.sensor_normal[spots]

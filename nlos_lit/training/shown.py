@@ -171,7 +171,7 @@ def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray,
     parts: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(spots), block):
         index = torch.from_numpy(spots[first : first + block]).to(module.device)
-        surface = pipeline.geometry(volume, origins[index], normals[index])
+        surface = pipeline.surface(volume, origins[index], normals[index])
         met = surface.normal.any(1)  # off the CPU there are rows to spare, without a normal
         point, normal = surface.point[met], surface.normal[met]
         values = trilinear(albedo, point, pipeline.geometry.lattice)
