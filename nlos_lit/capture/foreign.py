@@ -57,7 +57,8 @@ def archived(file: Path, packed: bool = False) -> Path:
         raise UserError(f"{file} is no regular file")
     with zipfile.ZipFile(file) as archive:
         held = sum(part.file_size for part in archive.infolist())
-    most = min(max(found.st_size, PACKED * packed), psutil.virtual_memory().available)
+    most = max(found.st_size, PACKED) if packed else found.st_size
+    most = min(most, psutil.virtual_memory().available)
     if held > most:
         raise UserError(f"{file} unpacks to {held / 1e9:.2g} GB, where {most / 1e9:.2g} GB are allowed")
     return file

@@ -396,21 +396,25 @@ class Loop:
         Returns:
             That, and how it stood when the first look-alike left, if one did.
         """
-        (staying, left, scene, coarse), whole = now, None
+        (staying, away, scene, coarse), whole = now, None
+
+        def leaving() -> list[Member]:
+            nonlocal whole
+            gone = _leaving(staying, enough)
+            if not gone and apart and (gone := _sharing(staying)):
+                whole = whole or Standing(staying, away, scene, coarse)
+            return gone
+
         while staying:
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            for anew in (False, True):
-                if anew and coarse is not None:
-                    staying = self._anew(staying, coarse, scene)
-                gone = _leaving(staying, enough)
-                if not gone and apart and (gone := _sharing(staying)):
-                    whole = whole or Standing(staying, left, scene, coarse)
-                if gone:
-                    break
-            else:
+            gone = leaving()
+            if not gone and coarse is not None:
+                staying = self._anew(staying, coarse, scene)
+                gone = leaving()
+            if not gone:
                 break
-            left = left | {m.name: replace(m, gone=True) for m in gone}
+            away = away | {m.name: replace(m, gone=True) for m in gone}
             staying = [m for m in staying if m not in gone]
             if coarse is None or before is None:
                 scene = self._bare(scene, gone, asked)
@@ -420,7 +424,7 @@ class Loop:
                 names = [m.name for m in [*before.members, *staying]]
                 coarse = self.built_with(coarse, names)
                 scene = self.better(self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
-        return Standing(staying, left, scene, coarse), whole
+        return Standing(staying, away, scene, coarse), whole
 
     def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """A parsimonious scene with some of its terms: gone on with, or built anew.
