@@ -38,14 +38,8 @@ def lights(model, scene) -> tuple[Tensor, Tensor]:
     nearest = torch.from_numpy(cKDTree(centre.numpy()).query(elements.centre)[1])
     fitted, true = [], []
     for spots in torch.arange(len(model.laser)).split(48):
-        wall = (
-            model.laser[spots],
-            model.laser_normal[spots],
-            model.sensor[spots],
-            model.sensor_normal[spots],
-        )
         fitted.append(model.paths(spots).contribution.sum(2) * model.albedo())
-        paths = trace(place, normal, torch.ones(2), quadrature(1), *wall, model.confocal)
+        paths = trace(place, normal, torch.ones(2), quadrature(1), model.walls(spots))
         light = paths.contribution[:, :, 0] / paths.area * shine * seen[spots]
         true.append(torch.zeros(len(spots), len(centre)).index_add_(1, nearest, light))
     return torch.cat(fitted), torch.cat(true)

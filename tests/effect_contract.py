@@ -28,7 +28,7 @@ from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 BIN, T_START, GATE, SPOTS = 0.02, 0.62, (6, 64), 10
 HOOKS_OF_STAGE = {
     "path": {"path", "transients"},
-    "time": {"time", "path"},
+    "time": {"time", "path", "walls"},
     "response": {"response"},
     "spot": {"gain", "background"},
     "counting": {"counting"},

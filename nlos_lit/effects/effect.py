@@ -47,13 +47,14 @@ class Effect(nn.Module, Hooks):
             over its neighbours counts.
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
             it with the same values.
-        imitated: real captures have it strongly, and a scene fitted without it imitates it by surfels. A
-            diagnosis also builds a scene with all such effects from the first surfel on.
+        imitated: a scene fitted without it imitates it: its "light" by more surfels, as of what real captures
+            have strongly, or its "geometry" by places and normals. A diagnosis also builds a scene with all
+            effects of either kind from the first surfel on.
         followed_by: free terms that can do what it does: they take any values where it follows an equation.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.
-        needs_paths: it acts on single paths (path, time and transients hooks); the others act on whole
+        needs_paths: it acts on single paths (walls, path, time and transients hooks); the others act on whole
             transients.
     """
 
@@ -66,7 +67,7 @@ class Effect(nn.Module, Hooks):
     lasting: ClassVar[bool] = False
     followed_by: ClassVar[tuple[str, ...]] = ()
     with_power: ClassVar[tuple[str, ...]] = ()
-    imitated: ClassVar[bool] = False
+    imitated: ClassVar[Literal["light", "geometry"] | None] = None
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False
@@ -177,7 +178,7 @@ class Effect(nn.Module, Hooks):
     @property
     def moves_light(self) -> bool:
         """It moves or scales light by path or spot, as errors of places, normals and albedos do."""
-        return bool(self.hooks & {"path", "time", "gain"})
+        return bool(self.hooks & {"walls", "path", "time", "gain"})
 
     @property
     def amplitudes(self) -> list[Parameter]:

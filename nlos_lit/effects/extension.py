@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.hooks import Hooks
-from nlos_lit.functional.surfel_paths import Paths
+from nlos_lit.functional.surfel_paths import Paths, Walls
 
 
 class Extension(nn.Module, Hooks):
@@ -24,6 +24,11 @@ class Extension(nn.Module, Hooks):
     def __init__(self, effects: Sequence[Effect]) -> None:
         super().__init__()
         self.effects = cast(Sequence[Effect], nn.ModuleList(effects))
+
+    def walls(self, walls: Walls, spots: Tensor) -> Walls:
+        for effect in self.effects:
+            walls = effect.walls(walls, spots)
+        return walls
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         for effect in self.effects:

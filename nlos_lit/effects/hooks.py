@@ -4,18 +4,18 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from nlos_lit.functional.surfel_paths import Paths
+from nlos_lit.functional.surfel_paths import Paths, Walls
 
 # From the hooks that an effect overrides to its stage; the first that fits: an effect that moves arrivals may
 # change their energy, too.
 STAGE_OF_HOOKS = (
-    ("time", frozenset({"time"})),
+    ("time", frozenset({"walls", "time"})),
     ("path", frozenset({"path", "transients"})),
     ("response", frozenset({"response"})),
     ("spot", frozenset({"gain", "background"})),
     ("counting", frozenset({"counting"})),
 )
-OF_PATHS = frozenset({"path", "time", "transients"})
+OF_PATHS = frozenset({"walls", "path", "time", "transients"})
 
 
 class Hooks:
@@ -23,6 +23,18 @@ class Hooks:
 
     B spots of a batch, M surfels, Q points on each, T time bins from bin 0 to the end of the gate.
     """
+
+    def walls(self, walls: Walls, spots: Tensor) -> Walls:
+        """Where light really leaves the wall and comes back.
+
+        Args:
+            walls: so far; the capture's own at first.
+            spots: ``[B]`` indices into the scan.
+
+        Returns:
+            as many points and normals.
+        """
+        return walls
 
     def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
         """Energy of each path.

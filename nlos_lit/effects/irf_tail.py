@@ -39,7 +39,7 @@ class IrfTail(Effect):
         headline="{fraction} of the photons, τ = {decay}",
     )
     witness = "tail"
-    imitated = True
+    imitated = "light"
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

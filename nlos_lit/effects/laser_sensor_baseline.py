@@ -9,13 +9,13 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.surfel_paths import Paths
+from nlos_lit.functional.surfel_paths import Walls
 
 
 class LaserSensorBaseline(Effect):
     """The sensor looks at ``sensor + (baseline_x, baseline_y, 0)``; the laser hits its stated point.
 
-    ``d2 → |p - s - b|`` in length and throughput (d2⁻², both cosines), worked out at the surfels' centres.
+    ``s → s + b`` for the point that paths end at; a confocal scan is none any more.
 
     Parameters: ``baseline_x``, ``baseline_y`` (m), null 0.
 
@@ -29,6 +29,7 @@ class LaserSensorBaseline(Effect):
     """
 
     name = "laser_sensor_baseline"
+    imitated = "geometry"
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
@@ -37,12 +38,6 @@ class LaserSensorBaseline(Effect):
         remedy="Realign the two beams on the wall, or give the sensor's true points.",
         headline="{baseline_x} along x, {baseline_y} along y",
     )
-
-    sensor: Tensor
-
-    def __init__(self, scan: Scan) -> None:
-        super().__init__(scan)
-        self.register_buffer("sensor", scan.sensor.clone(), persistent=False)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
@@ -56,26 +51,7 @@ class LaserSensorBaseline(Effect):
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"baseline_x": 0.05 * scan.half, "baseline_y": 0.0}
 
-    def path(self, contribution: Tensor, paths: Paths, spots: Tensor) -> Tensor:
-        stated, real = self.legs(paths, spots)
-        facing = [(-(leg * paths.normal).sum(2)).clamp_min(1e-6) for leg in (stated, real)]
-        squares = [leg.square().sum(2) for leg in (stated, real)]
-        return contribution * (facing[1] / facing[0] * (squares[0] / squares[1]) ** 2)[..., None]
-
-    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
-        stated, real = self.legs(paths, spots)
-        return length + (real.norm(dim=2) - stated.norm(dim=2))[..., None]
-
-    def legs(self, paths: Paths, spots: Tensor) -> tuple[Tensor, Tensor]:
-        """From the sensor's stated and its real point to the surfels' centres.
-
-        Args:
-            paths: for the centres.
-            spots: ``[B]`` indices into the scan.
-
-        Returns:
-            Both ``[B, M, 3]`` m.
-        """
-        stated = paths.centre - self.sensor[spots][:, None]
-        x, y = self.value("baseline_x"), self.value("baseline_y")
-        return stated, stated - torch.stack([x, y, torch.zeros_like(x)])
+    def walls(self, walls: Walls, spots: Tensor) -> Walls:
+        baseline = torch.stack([self.value("baseline_x"), self.value("baseline_y")])
+        moved = walls.sensor + torch.nn.functional.pad(baseline, (0, 1))
+        return walls._replace(sensor=moved, confocal=False)

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.surfel_paths import Paths
+from nlos_lit.functional.surfel_paths import Walls
 
 
 class WallTilt(Effect):
-    """The wall is tilted: its points stand nearer or farther than the file says.
+    """The wall is tilted: its points stand nearer or farther than the file says, and face aside.
 
-    ``L → L - cosθ_laser z_laser - cosθ_sensor z_sensor``, ``z = tilt_x X + tilt_y Y`` beyond the stated
-    place, X and Y from the scan's centre, cosθ between the wall's normal and the leg to the surfel's centre.
+    ``z → z + tilt_x X + tilt_y Y`` for the laser's and the sensor's points, X and Y from the scan's centre,
+    ``n → n - (tilt_x, tilt_y, 0)``, made a unit again, for the wall's normals.
 
     Parameters: ``tilt_x``, ``tilt_y`` (rad), null 0.
 
@@ -24,10 +25,11 @@ class WallTilt(Effect):
     Degenerate with: a turn of the whole scene about the wall's centre (almost perfectly, for small scenes);
     ``time_drift`` along the slow axis of a raster scan.
 
-    Source: geometry, to first order in the tilt.
+    Source: geometry.
     """
 
     name = "wall_tilt"
+    imitated = "geometry"
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(
@@ -38,14 +40,10 @@ class WallTilt(Effect):
         headline="{tilt_x} along x, {tilt_y} along y",
     )
 
-    laser: Tensor
-    sensor: Tensor
     centre: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
-        self.register_buffer("laser", scan.laser.clone(), persistent=False)
-        self.register_buffer("sensor", scan.sensor.clone(), persistent=False)
         self.register_buffer("centre", scan.centre.clone(), persistent=False)
 
     @classmethod
@@ -58,22 +56,20 @@ class WallTilt(Effect):
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"tilt_x": 0.03, "tilt_y": 0.0}
 
-    def time(self, length: Tensor, paths: Paths, spots: Tensor) -> Tensor:
-        laser = self.shorter(self.laser[spots], paths.centre)
-        sensor = laser if self.scan.confocal else self.shorter(self.sensor[spots], paths.centre)
-        return length - (laser + sensor)[..., None]
+    def walls(self, walls: Walls, spots: Tensor) -> Walls:
+        tilt = torch.stack([self.value("tilt_x"), self.value("tilt_y")])
 
-    def shorter(self, wall: Tensor, centre: Tensor) -> Tensor:
-        """By how much legs get shorter.
+        def place(wall: Tensor) -> Tensor:
+            z = ((wall[:, :2] - self.centre) * tilt).sum(1, keepdim=True)
+            return wall + torch.nn.functional.pad(z, (2, 0))
 
-        Args:
-            wall: ``[B, 3]`` m, where they begin.
-            centre: ``[M, 3]`` m, where they end.
+        def facing(normal: Tensor) -> Tensor:
+            return torch.nn.functional.normalize(normal - torch.nn.functional.pad(tilt, (0, 1)), dim=1)
 
-        Returns:
-            ``[B, M]`` m.
-        """
-        away = centre - wall[:, None]
-        place = wall[:, :2] - self.centre
-        z = self.value("tilt_x") * place[:, 0] + self.value("tilt_y") * place[:, 1]
-        return z[:, None] * away[..., 2] / away.norm(dim=2)
+        return Walls(
+            place(walls.laser),
+            facing(walls.laser_normal),
+            place(walls.sensor),
+            facing(walls.sensor_normal),
+            walls.confocal,
+        )

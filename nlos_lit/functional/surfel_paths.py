@@ -29,6 +29,16 @@ PIECES = torch.tensor([[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1
 )
 
 
+class Walls(NamedTuple):
+    """Where the light of B spots leaves the wall, and where it comes back."""
+
+    laser: Tensor  # [B, 3] m, illuminated
+    laser_normal: Tensor  # [B, 3] unit, towards the hidden scene
+    sensor: Tensor  # [B, 3] m, observed; the laser's when confocal
+    sensor_normal: Tensor  # [B, 3] unit
+    confocal: bool
+
+
 class Paths(NamedTuple):
     """Third-bounce paths of B spots over M surfels with Q quadrature points each."""
 
@@ -127,11 +137,7 @@ def trace(
     normal: Tensor,
     cell: Tensor,
     offsets: Tensor,
-    laser: Tensor,
-    laser_normal: Tensor,
-    sensor: Tensor,
-    sensor_normal: Tensor,
-    confocal: bool,
+    walls: Walls,
     curvature: Tensor | None = None,
     seen: Tensor | None = None,
 ) -> Paths:
@@ -142,11 +148,7 @@ def trace(
         normal: ``[M, 3]`` unit, towards the wall's side.
         cell: ``[2]`` lateral extents, m.
         offsets: ``[Q, 2]`` from :func:`quadrature`.
-        laser: ``[B, 3]`` illuminated wall points, m.
-        laser_normal: ``[B, 3]`` unit normals there.
-        sensor: ``[B, 3]`` observed wall points, m; not used when ``confocal``.
-        sensor_normal: ``[B, 3]`` unit normals there; not used when ``confocal``.
-        confocal: whether the sensor looks at the laser's points.
+        walls: points and normals of the spots.
         curvature: ``[M, 3, 3]`` 1/m, see :func:`on_patch`; None for flat patches.
         seen: ``[B, M]`` share of each surfel's light that is not hidden; None where all is seen.
 
@@ -159,7 +161,7 @@ def trace(
         >>> import torch
         >>> spot, up = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 1.0]])
         >>> cell = torch.tensor([0.01, 0.01])
-        >>> paths = trace(up, -up, cell, quadrature(1), spot, up, spot, up, confocal=True)
+        >>> paths = trace(up, -up, cell, quadrature(1), Walls(spot, up, spot, up, confocal=True))
         >>> round(paths.contribution.item(), 8), paths.length.item()
         (0.0001, 2.0)
     """
@@ -167,12 +169,12 @@ def trace(
     # From the middle of the scene, so that differences of squares keep their digits, in any batch the same.
     middle = centre.detach().mean(0)
     points = centre[:, None] + place - middle
-    seen = points.new_ones(len(laser), len(centre)) if seen is None else seen
-    factor, leg, cosine = _legs(points, facing, laser - middle, laser_normal)
-    if confocal:
+    seen = points.new_ones(len(walls.laser), len(centre)) if seen is None else seen
+    factor, leg, cosine = _legs(points, facing, walls.laser - middle, walls.laser_normal)
+    if walls.confocal:
         energy = _energies(share, seen, factor, factor)
         return Paths(energy, 2 * leg, leg, leg, cosine, cosine, centre, normal, share.sum(1))
-    other, other_leg, other_cosine = _legs(points, facing, sensor - middle, sensor_normal)
+    other, other_leg, other_cosine = _legs(points, facing, walls.sensor - middle, walls.sensor_normal)
     energy, legs = _energies(share, seen, factor, other), (leg, other_leg, cosine, other_cosine)
     return Paths(energy, leg + other_leg, *legs, centre, normal, share.sum(1))
 
@@ -228,10 +230,11 @@ class _Patches(torch.autograd.Function):
 
 
 def _legs(points: Tensor, facing: Tensor, wall: Tensor, normal: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel ``[B, M, Q]`` of legs from wall points ``[B, 3]``, which
-    have no gradients, to points ``[M, Q, 3]``.
+    """cosθ_wall cosθ_surfel / d², d and cosθ_surfel ``[B, M, Q]`` of legs from wall points ``[B, 3]`` to
+    points ``[M, Q, 3]``. The compiled ones have no gradients of the wall's.
     """
-    return (_Legs.apply if compiled(points) else _plain_legs)(points, facing, wall, normal)
+    fixed = not (wall.requires_grad or normal.requires_grad)
+    return (_Legs.apply if fixed and compiled(points) else _plain_legs)(points, facing, wall, normal)
 
 
 def _plain_legs(

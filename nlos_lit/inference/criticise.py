@@ -51,7 +51,7 @@ LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
 HALF = 0.5  # of the misfit: one effect predicts less of what a scene lacks for unknown reasons
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
-IMITATED = frozenset(cls.name for cls in EFFECTS if cls.imitated)
+IMITATED = [frozenset(cls.name for cls in EFFECTS if cls.imitated == kind) for kind in ("light", "geometry")]
 
 
 @dataclass(frozen=True)
@@ -247,10 +247,10 @@ class Loop:
     def begun(self, base: SurfelFit, fine: SurfelFit, pool: Pool) -> tuple[SurfelFit, list[Member]]:
         """The parsimonious scene that the search begins with.
 
-        Beside a scene that has imitated a strong effect the counts do not ask for that any more. So a scene
-        is also built with all effects that scenes imitate, at their nulls, from the first surfel on. It is
-        taken where it surely predicts better than the fine scene without any, which has more surfels. Where
-        there are no such effects they are a burden.
+        Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
+        are also built with all effects of each kind that scenes imitate, at their nulls, from the first
+        surfel on. The best is taken where it surely predicts better than the fine scene without any, which
+        has more surfels. Where there are no such effects they are a burden.
 
         Args:
             base: without effects, parsimonious.
@@ -260,17 +260,22 @@ class Loop:
         Returns:
             the scene, and the effects that it has.
         """
-        members = [Member(c) for c in pool.candidates if c.name in IMITATED]
-        if not members:
-            return base, []
-        extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
-        for effect in extension.effects:
-            effect.reset()
-            effect.requires_grad_(True)
-        self.steps.plan(fit=1)
-        text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
-        fit = self.steps("fit", text, "begun", partial(self._or_base, base, extension))
-        return (fit, members) if fit.extension.effects and self.predicts(fit, fine, SURE) else (base, [])
+        found = [(base, list[Member]())]
+        for kind, names in enumerate(IMITATED):
+            members = [Member(c) for c in pool.candidates if c.name in names]
+            if not members:
+                continue
+            extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
+            for effect in extension.effects:
+                effect.reset()
+                effect.requires_grad_(True)
+            self.steps.plan(fit=1)
+            text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
+            fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
+            if fit.extension.effects and self.predicts(fit, fine, SURE):
+                found.append((fit, members))
+        best = self.better(*(fit for fit, _ in found))
+        return next(one for one in found if one[0] is best)
 
     def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
         """A scene built with the effects, or the base, where no surfel survives with them."""

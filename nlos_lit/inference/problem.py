@@ -124,7 +124,7 @@ def build_problem(
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
         with torch.no_grad():
-            light.append(model.transients(model.paths(part), part, extension))
+            light.append(model.transients(model.paths(part, extension), part, extension))
         surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
@@ -261,10 +261,14 @@ def _staged(
 ) -> _Forward:
     """The part of the forward model after what an effect cannot change, the part before worked out."""
     if effect.needs_paths:
-        paths = model.paths(spots)
-        return _Forward(model, extension, lambda m, e: m.record(m.transients(paths, spots, e), spots, e))
+        paths = None if "walls" in effect.hooks else model.paths(spots, extension)
+
+        def render(m: SurfelModel, e: Extension) -> Tensor:
+            return m.record(m.transients(m.paths(spots, e) if paths is None else paths, spots, e), spots, e)
+
+        return _Forward(model, extension, render)
     if transients is None:
-        transients = model.transients(model.paths(spots), spots, extension)
+        transients = model.transients(model.paths(spots, extension), spots, extension)
     if effect.stage == "response":
         return _recording(model, extension, spots, transients)
     signal = model.signal(transients, extension)
@@ -323,14 +327,13 @@ def _transient_columns(
     of the J functions ``towards`` ``[B, J]`` of the wall point is 1.
     """
     centre, normal, albedo = (v.detach() for v in (*model.placed(), model.albedo()))
-    walls = (model.laser[spots], model.laser_normal[spots], model.sensor[spots], model.sensor_normal[spots])
-    offsets = quadrature(model.quadrature, centre.device)
+    walls, offsets = model.walls(spots, extension), quadrature(model.quadrature, centre.device)
     seen = model.arriving(model.hiders[:, spots]).detach()[:, :, None] if len(model.hiders) else 1.0
 
     def place(rho: Tensor, depth: Tensor, side: Tensor) -> tuple[Tensor, Tensor]:
         moved = centre + (depth * model.bin_length / 2)[:, None] * model.direction
         moved = moved + torch.nn.functional.pad(side * model.bin_length / 2, (0, 1))
-        paths = trace(moved, normal, model.cell, offsets, *walls, model.confocal, model.curvature)
+        paths = trace(moved, normal, model.cell, offsets, walls, model.curvature)
         paths = paths._replace(contribution=paths.contribution * seen)
         energy = extension.path(paths.contribution * rho[:, None], paths, spots)
         return energy, model.arrival(extension.time(paths.length, paths, spots))

@@ -29,7 +29,7 @@ def asked_of(
     found = []
     for part, pull, unit in zip(spots.split(32), (excess * noise).split(32), noise.split(32), strict=True):
         with torch.no_grad():
-            paths = model.paths(part)
+            paths = model.paths(part, extension)
         light = paths.contribution.requires_grad_()
         rendered = model.record(model.transients(paths, part, extension), part, extension)
         rendered = rendered[:, model.gate[0] :]
@@ -58,7 +58,9 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
     """
 
     def arriving() -> Tensor:
-        return torch.cat([model.transients(model.paths(part), part, extension) for part in spots.split(32)])
+        return torch.cat(
+            [model.transients(model.paths(part, extension), part, extension) for part in spots.split(32)]
+        )
 
     def expected(effect: Effect, light: Tensor) -> Tensor:
         transients = arriving() if effect.needs_paths else light

@@ -423,8 +423,6 @@ class SurfelFit:
         """Of places, by the tested spots; bins that were not recorded ask for nothing."""
         spots, counts = self.train[self.tested], self.counts[self.tested]
         expected = self.model.expected(spots, self.extension).clamp_min(1e-9)
-        if self.observed is not None:
-            counts = torch.where(self.observed[self.tested], counts, expected)
         return PlaceTest(self.model, self.capture, spots, counts, expected, self.extension)
 
     def _take_back(self, undo: dict[str, Any]) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from nlos_lit.functional.irf import convolve_time, response
 from nlos_lit.functional.surfel_graph import BEND, misfits
 from nlos_lit.functional.surfel_paths import (
     SPLINE_VARIANCE,
+    Walls,
     quadrature,
     spline_at,
     spread,
@@ -171,8 +173,7 @@ def score(
     cell: tuple[float, float],
     points: int,
     laser_sensor: LaserSensor,
-    counts: Tensor,
-    expected: Tensor,
+    asked: tuple[Tensor, Tensor],
     spots: Tensor,
     hooks: Hooks = NOTHING,
     visible: Tensor | None = None,
@@ -185,17 +186,17 @@ def score(
         cell: extents of a cell, m.
         points: quadrature points along each side.
         laser_sensor: present response.
-        counts: ``[B, T_gate]`` of the spots.
-        expected: ``[B, T_gate]`` of the spots.
+        asked: ``[B, T_gate]`` each, of the spots' bins: derivative of the likelihood by what arrives there,
+            and its information; ``H/μ - 1`` and ``1/μ`` where all that arrives is counted.
         spots: ``[B]`` rows of the capture that are looked at.
-        hooks: effects, whose response is applied.
+        hooks: effects: where the walls are, what they do to paths and times, and the response.
         visible: ``[B, V]`` share of each place's light that the spots see; None: all.
 
     Returns:
         score and information of each place's albedo, and how wall blocks agree.
     """
     sensor, bins = laser_sensor, capture.gate[1]
-    device = counts.device
+    device = asked[0].device
 
     def adjoint(image: Tensor, kernel: Tensor) -> Tensor:
         full = torch.nn.functional.pad(image, (bins - image.shape[1], 0))
@@ -209,14 +210,13 @@ def score(
         sensor.lead,
     )
     whole = hooks.response(whole, sensor.lead)
-    pull = adjoint(counts / expected - 1, kernel)
-    weight = adjoint(1 / expected, whole**2).clamp_min(0)
+    pull, weight = adjoint(asked[0], kernel), adjoint(asked[1], whole**2).clamp_min(0)
     rows = spots.cpu().numpy()
     laser, laser_normal, sensor_point, sensor_normal = (
         torch.tensor(points[rows], dtype=torch.float32, device=device)
         for points in (capture.laser, capture.laser_normal, capture.sensor, capture.sensor_normal)
     )
-    walls = (laser, laser_normal, sensor_point, sensor_normal)
+    walls = hooks.walls(Walls(laser, laser_normal, sensor_point, sensor_normal, capture.confocal), spots)
     offsets = quadrature(points, device)
     extent = torch.tensor(cell, device=device).abs()
     n = len(candidates.centre)
@@ -225,12 +225,12 @@ def score(
     size = max(1, CHUNK // (len(spots) * len(offsets)))
     for start in range(0, n, size):
         part = candidates.take(torch.arange(start, min(n, start + size), device=device))
-        paths = trace(part.centre, part.normal, extent, offsets, *walls, capture.confocal)
+        seen = None if visible is None else visible[:, start : start + len(part.centre)]
+        paths = trace(part.centre, part.normal, extent, offsets, walls, seen=seen)
         shape = paths.length.shape
-        time = ((paths.length - capture.t_start) / capture.bin_length).flatten(1)
-        energy = paths.contribution
-        if visible is not None:
-            energy = energy * visible[:, start : start + len(part.centre), None]
+        length = hooks.time(paths.length, paths, spots)
+        time = ((length - capture.t_start) / capture.bin_length).flatten(1)
+        energy = hooks.path(paths.contribution, paths, spots)
         g = (energy * spline_at(pull, time)[0].view(shape)).sum(2)
         # Cauchy-Schwarz: exact where the points of a cell arrive together, above the true information
         # otherwise.
@@ -434,7 +434,7 @@ class PlaceTest:
         spots: ``[B]`` rows of the capture that are looked at.
         counts: ``[B, T_gate]`` of the spots.
         expected: ``[B, T_gate]`` of the spots by the model.
-        hooks: effects of the present expectation; places are tested with their response.
+        hooks: effects of the present expectation; what they do to light is done to that of places, too.
     """
 
     model: SurfelModel
@@ -443,6 +443,14 @@ class PlaceTest:
     counts: Tensor
     expected: Tensor
     hooks: Hooks = NOTHING
+
+    @cached_property
+    def asked(self) -> tuple[Tensor, Tensor]:
+        """As for :func:`score`. Where a count depends on what arrived before, as with a dead time, the second
+        takes it that it does not.
+        """
+        back = self.model.pull_back(self.spots, self.hooks, self.counts / self.expected - 1)
+        return back[0], back[1].square() / self.expected
 
     def surfels(self) -> Score:
         """Of the surfels themselves, with the light that they are seen by."""
@@ -462,7 +470,7 @@ class PlaceTest:
 
     def _score(self, places: Seeds, points: int, visible: Tensor | None) -> Score:
         cell, sensor = (float(self.model.cell[0]), float(self.model.cell[1])), self.model.laser_sensor
-        given = (places, self.capture, cell, points, sensor, self.counts, self.expected)
+        given = (places, self.capture, cell, points, sensor, self.asked)
         return score(*given, self.spots, self.hooks, visible)
 
 

@@ -29,6 +29,7 @@ from nlos_lit.functional.surfel_paths import (
     STEEP,
     Paths,
     SplineSplat,
+    Walls,
     on_patch,
     quadrature,
     spread,
@@ -384,21 +385,36 @@ class SurfelModel(nn.Module):
         legs = [passes.index_select(0, leg.reshape(-1)).view(leg.shape) for leg in hiders]
         return math.prod(legs[1:], start=legs[0]).mean(2)
 
-    def paths(self, spots: Tensor, placed: tuple[Tensor, Tensor] | None = None) -> Paths:
+    def walls(self, spots: Tensor, hooks: Hooks = NOTHING) -> Walls:
+        """Wall points and normals of spots.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that move them.
+
+        Returns:
+            the points.
+        """
+        stated = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
+        return hooks.walls(Walls(*stated, self.confocal), spots)
+
+    def paths(
+        self, spots: Tensor, hooks: Hooks = NOTHING, placed: tuple[Tensor, Tensor] | None = None
+    ) -> Paths:
         """Stage 1: all paths over all surfels, for unit albedo.
 
         Args:
             spots: ``[B]`` rows of the capture.
+            hooks: effects that move the wall's points.
             placed: from :meth:`placed`, where it is known.
 
         Returns:
             the paths.
         """
-        walls = (self.laser[spots], self.laser_normal[spots], self.sensor[spots], self.sensor_normal[spots])
         offsets = quadrature(self.quadrature, self.anchor.device)
         centre, normal = placed or self.placed()
         seen = self.arriving(self.hiders[:, spots]) if len(self.hiders) else None
-        return trace(centre, normal, self.cell, offsets, *walls, self.confocal, self.curvature, seen)
+        return trace(centre, normal, self.cell, offsets, self.walls(spots, hooks), self.curvature, seen)
 
     def arrival(self, length: Tensor) -> Tensor:
         """Stage 2: path length (m) as time in bins from the capture's bin 0."""
@@ -504,7 +520,7 @@ class SurfelModel(nn.Module):
         Returns:
             ``[B, T_gate]`` expected counts.
         """
-        transients = self.transients(self.paths(spots, placed), spots, hooks)
+        transients = self.transients(self.paths(spots, hooks, placed), spots, hooks)
         return self.record(transients, spots, hooks)[:, self.gate[0] :]
 
     forward = render
@@ -523,6 +539,29 @@ class SurfelModel(nn.Module):
         return torch.cat([self.render(part, hooks) for part in self._batches(spots)])
 
     @torch.no_grad()
+    def pull_back(self, spots: Tensor, hooks: Hooks, asked: Tensor) -> tuple[Tensor, Tensor]:
+        """What counts ask of light that arrives, back through counting and gain.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects.
+            asked: ``[B, T_gate]`` of each count.
+
+        Returns:
+            ``[B, T_gate]`` of each that arrives in a bin, and counts for each; 0 in bins that were not
+            recorded.
+        """
+        found = []
+        for part, of_counts in zip(self._batches(spots), self._batches(spots, asked), strict=True):
+            signal = self.signal(self.transients(self.paths(part, hooks), part, hooks), hooks)
+            with torch.enable_grad():
+                counted = self.detect(signal.requires_grad_(), part, hooks)[:, self.gate[0] :]
+                by = [(counted * of_counts).sum(), counted.sum()]
+                found.append(torch.stack([torch.autograd.grad(x, signal, retain_graph=True)[0] for x in by]))
+        pulled, counts = torch.cat(found, 1)[..., self.gate[0] :]
+        return pulled, counts
+
+    @torch.no_grad()
     def light(self, spots: Tensor, hooks: Hooks = NOTHING) -> Tensor:
         """The light by itself, before background and counting effects.
 
@@ -534,11 +573,15 @@ class SurfelModel(nn.Module):
             ``[B, T_gate]`` counts.
         """
         parts = self._batches(spots)
-        signals = [hooks.gain(self.signal(self.transients(self.paths(p), p, hooks), hooks), p) for p in parts]
+        signals = [
+            hooks.gain(self.signal(self.transients(self.paths(p, hooks), p, hooks), hooks), p) for p in parts
+        ]
         return torch.cat(signals)[:, self.gate[0] :]
 
-    def _batches(self, spots: Tensor) -> tuple[Tensor, ...]:
-        return spots.split(max(1, (1 << 21) // max(1, len(self) * self.quadrature**2)))
+    def _batches(self, spots: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
+        """Parts of some spots, or of what belongs to them."""
+        size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
+        return (spots if rows is None else rows).split(size)
 
     def points(self) -> Points:
         """Surfel centres with normals and albedo."""

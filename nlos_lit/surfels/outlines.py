@@ -82,7 +82,7 @@ class _Linear(NamedTuple):
     @classmethod
     @torch.no_grad()
     def of(cls, model: SurfelModel, spots: Tensor, hooks: Hooks) -> _Linear:
-        paths, albedo = model.paths(spots), model.albedo()
+        paths, albedo = model.paths(spots, hooks), model.albedo()
         energy, time = model.arrivals(paths, spots, hooks, torch.ones_like(albedo))
         runs = Runs.of(energy, time, model.n_bins)
         direct = runs.send(albedo)

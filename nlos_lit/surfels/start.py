@@ -84,7 +84,8 @@ def seed_surfels(
     tested = order[: s.test_spots]
     candidates, value = volume_maxima(intensity, grid, RESERVE * s.floor, s.per_cell, lateral)
     null = rank_one(counts)[tested]
-    scores = score(candidates, capture, lateral.pitch, 1, sensor, counts[tested], null, train[tested])
+    asked = (counts[tested] / null - 1, 1 / null)
+    scores = score(candidates, capture, lateral.pitch, 1, sensor, asked, train[tested])
     significance = scores.significance * math.sqrt(len(train) / len(tested))
     keep = (significance > s.significance) & (value >= s.floor)
     if int(keep.sum()) > s.max_seeds:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 import torch
-from effect_contract import SPOTS, scene
+from effect_contract import SPOTS, capture, scene, surfels
 from effect_hand import ONE, SPOT, effect, hand_paths, hand_scan
 
+from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Asked
+from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.surfel_paths import Walls
 
 
 def test_retroreflection_turns_the_fourth_power_into_the_second():
@@ -96,95 +100,77 @@ def test_the_disc_is_looked_for_where_legs_lose_light(confocal, x, y):
     assert len(nothing) == 20
 
 
-def test_wall_tilt_shortens_legs():
-    # Spot at X = 0.4 of a scan centred on 0.1: X from its centre is 0.3, z = 0.02 · 0.3 = 6 mm. Leg (-0.3, 0,
-    # 0.4): cos = 0.8.
+def walls_at(*points: tuple[float, float]) -> Walls:
+    """Of a confocal scan, facing the scene."""
+    place = torch.tensor([[x, y, 0.0] for x, y in points])
+    up = torch.tensor([[0.0, 0.0, 1.0]]).expand_as(place)
+    return Walls(place, up, place, up, confocal=True)
+
+
+def small_scan() -> Scan:
+    """Spots at x = -0.2 and 0.4, so that its centre is at 0.1."""
     scan = hand_scan([[0.4, 0.0, 0.0], [-0.2, 0.0, 0.0]])
-    scan = dataclasses.replace(scan, places=(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]),), half=0.3)
-    tilt = effect("wall_tilt", scan=scan, tilt_x=0.02)
-    length = tilt.time(ONE, hand_paths(centre=(0.1, 0.0, 0.4)), SPOT).item()
-    assert length == pytest.approx(1 - 2 * 0.8 * 0.006, abs=1e-6)
-    assert effect("wall_tilt", scan=scan, tilt_y=0.02).time(ONE, hand_paths(), SPOT).item() == 1.0
+    return dataclasses.replace(scan, places=(torch.tensor([[1.0, 0.0], [-1.0, 0.0]]),), half=0.3)
 
 
-def test_wall_tilt_is_the_real_change_of_length():
-    tilt = effect("wall_tilt", "exhaustive", tilt_x=0.01, tilt_y=-0.005)
-    model, scan = scene("exhaustive")
-    spots = torch.arange(SPOTS)
-    paths = model.paths(spots)
-    moved = []
-    for wall in (scan.laser, scan.sensor):
-        low, high = (torch.cat([scan.laser, scan.sensor])[:, :2].aminmax(dim=0)[k] for k in (0, 1))
-        x, y = (wall[:, :2] - (low + high) / 2).T
-        real = wall + torch.stack([0 * x, 0 * x, 0.01 * x - 0.005 * y], 1)
-        moved.append(torch.cdist(real, paths.centre) - torch.cdist(wall, paths.centre))
-    ours = (tilt.time(paths.length, paths, spots) - paths.length)[..., 0]
-    assert ours.detach() == pytest.approx((moved[0] + moved[1]).detach(), abs=2e-5)
+def test_a_tilted_wall_stands_nearer_and_faces_aside():
+    # X from the scan's centre is 0.3: z = 0.75 · 0.3. The plane z = 0.75 x has the normal (-0.6, 0, 0.8).
+    tilt = effect("wall_tilt", scan=small_scan())
+    tilt.declared["tilt_x"] = dataclasses.replace(tilt.declared["tilt_x"], upper=1.0)
+    tilt.set("tilt_x", 0.75)
+    real = tilt.walls(walls_at((0.4, 0.0), (-0.2, 0.3)), SPOT)
+    assert real.confocal
+    assert real.laser.detach().numpy() == pytest.approx(np.array([[0.4, 0, 0.225], [-0.2, 0.3, -0.225]]))
+    for normal in (real.laser_normal, real.sensor_normal):
+        assert normal.detach().numpy() == pytest.approx(np.array([[-0.6, 0.0, 0.8]] * 2))
+    assert torch.equal(real.sensor, real.laser)
+    y = effect("wall_tilt", scan=small_scan(), tilt_y=-0.02).walls(walls_at((0.4, 0.5)), SPOT)
+    assert y.laser.detach().numpy() == pytest.approx(np.array([[0.4, 0.5, -0.01]]))
 
 
-def test_a_larger_scan_is_the_model_of_the_moved_points():
-    """Both in length and in light, against surfels traced from the points where they really are."""
-    model, scan = scene("exhaustive")
-    wall, spots = effect("wall_scale", "exhaustive", scale=0.04), torch.arange(SPOTS)
-    stated = model.laser.clone(), model.sensor.clone()
-    paths = model.paths(spots)
-    centre = torch.cat([scan.centre, torch.zeros(1)])
-    model.laser, model.sensor = (centre + 1.04 * (points - centre) for points in stated)
-    real = model.paths(spots)
-    model.laser, model.sensor = stated
-    assert wall.time(paths.length, paths, spots).detach() == pytest.approx(real.length.detach(), abs=2e-3)
-    changed = wall.path(paths.contribution, paths, spots).sum(2).detach()
-    truth = real.contribution.sum(2).detach()
-    lit = truth > 0.05 * truth.max()
-    assert changed[lit] == pytest.approx(truth[lit], rel=0.02)
-
-
-def test_wall_scale_by_hand():
-    # Spots at X = -0.3 and 0.3 about 0. In a scan half as large again the second is at 0.45: the leg to
-    # (0.45, 0, 0.6) shrinks from √(0.15² + 0.6²) to 0.6, what it carries grows by their ratio's fourth power.
-    scan = dataclasses.replace(
-        hand_scan([[-0.3, 0.0, 0.0], [0.3, 0.0, 0.0]]),
-        places=(torch.tensor([[-1.0, 0], [1.0, 0]]),),
-        half=0.3,
-    )
-    wall = effect("wall_scale", scan=scan)
-    wall.declared["scale"] = dataclasses.replace(wall.declared["scale"], upper=1.0)
-    wall.set("scale", 0.5)
-    paths, spot = hand_paths(centre=(0.45, 0.0, 0.6)), torch.tensor([1])
-    leg = math.hypot(0.15, 0.6)
-    assert wall.time(ONE, paths, spot).item() == pytest.approx(1 - 2 * (leg - 0.6), abs=1e-6)
-    assert wall.path(ONE, paths, spot).item() == pytest.approx((leg / 0.6) ** 8, rel=1e-5)
+def test_each_side_of_a_scan_has_a_scale_of_its_own():
+    wall = effect("wall_scale", scan=small_scan(), scale_x=0.1, scale_y=-0.2)
+    real = wall.walls(walls_at((0.4, 0.5), (0.1, 0.0)), SPOT)
+    for place in (real.laser, real.sensor):
+        assert place.detach().numpy() == pytest.approx(np.array([[0.43, 0.4, 0], [0.1, 0.0, 0]]))
+    assert real.confocal
 
 
 def test_baseline_moves_the_sensor_alone():
-    # Sensor (0, 0, 0) looks at (0.3, 0, 0): the leg to (0.3, 0, 0.4) shrinks from 0.5 to 0.4.
-    scan = hand_scan([[0.0, 0.0, 0.0]])
-    scan = dataclasses.replace(scan, half=2.0)
-    baseline = effect("laser_sensor_baseline", scan=scan, baseline_x=0.3)
-    paths = hand_paths(centre=(0.3, 0.0, 0.4))
-    assert baseline.time(ONE, paths, SPOT).item() == pytest.approx(1 - 0.1, abs=1e-6)
-    # cosθ cosθ/d²: from 0.8²/0.25 to 1/0.16.
-    assert baseline.path(ONE, paths, SPOT).item() == pytest.approx((1 / 0.16) / (0.64 / 0.25), rel=1e-5)
+    baseline = effect("laser_sensor_baseline", scan=small_scan(), baseline_x=0.05, baseline_y=-0.03)
+    stated = walls_at((0.4, 0.5))
+    real = baseline.walls(stated, SPOT)
+    assert torch.equal(real.laser, stated.laser)
+    assert real.sensor.detach().numpy() == pytest.approx(np.array([[0.45, 0.47, 0.0]]))
+    assert not real.confocal
 
 
-def test_baseline_is_the_model_of_the_moved_sensor():
-    model, _ = scene("exhaustive")
-    baseline, spots = (
-        effect("laser_sensor_baseline", "exhaustive", baseline_x=0.02, baseline_y=-0.015),
-        torch.arange(SPOTS),
-    )
-    stated = model.sensor.clone()
-    paths = model.paths(spots)
-    model.sensor = stated + torch.tensor([0.02, -0.015, 0.0])
-    real = model.paths(spots)
-    model.sensor = stated
-    assert baseline.time(paths.length, paths, spots).detach() == pytest.approx(real.length.detach(), abs=2e-3)
-    changed, truth = (
-        baseline.path(paths.contribution, paths, spots).sum(2).detach(),
-        real.contribution.sum(2).detach(),
-    )
-    lit = truth > 0.05 * truth.max()
-    assert changed[lit] == pytest.approx(truth[lit], rel=0.01)
+@pytest.mark.parametrize("kind", ["confocal", "exhaustive"])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("wall_tilt", {"tilt_x": 0.03, "tilt_y": -0.02}),
+        ("wall_scale", {"scale_x": 0.1, "scale_y": -0.05}),
+        ("laser_sensor_baseline", {"baseline_x": 0.05, "baseline_y": -0.04}),
+    ],
+)
+def test_a_moved_wall_is_the_model_of_the_moved_points(kind, name, values):
+    """As if the file told of the real points; also where surfels stand edge on."""
+    model, _ = scene(kind)
+    moved = effect(name, kind, **values)
+    spots = torch.arange(SPOTS)
+    real = moved.walls(model.walls(spots), spots)
+    measured = capture(kind)
+    points = {
+        place: getattr(real, place).detach().double().numpy()
+        for place in ("laser", "laser_normal", "sensor", "sensor_normal")
+    }
+    other = surfels(dataclasses.replace(measured, **points))
+    other.load_state_dict(model.state_dict())
+    assert other.confocal == real.confocal
+    expected = model.expected(spots, Extension([moved]))
+    assert expected.numpy() == pytest.approx(other.expected(spots).numpy(), rel=1e-4, abs=1e-4)
+    assert float((expected - model.expected(spots)).abs().max()) > 0.02 * float(expected.max())
 
 
 def test_offsets_of_time():

@@ -17,7 +17,7 @@ from nlos_lit.functional.surfel_graph import (
     neighbour_pairs,
     sheet_normals,
 )
-from nlos_lit.functional.surfel_paths import SplineSplat, patches, quadrature, spline_at, trace
+from nlos_lit.functional.surfel_paths import SplineSplat, Walls, patches, quadrature, spline_at, trace
 from nlos_lit.functional.surfel_visibility import who_hides
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
@@ -92,8 +92,8 @@ def test_paths(plainly, confocal):
     up, seen = torch.tensor([[0.0, 0.0, 1.0]] * 5), torch.rand(5, 40, generator=GEN)
 
     def found(centre: Tensor, normal: Tensor, seen: Tensor) -> list[Tensor]:
-        walls = (laser, up, sensor, up)
-        return list(trace(centre, normal, CELL, quadrature(2), *walls, confocal, curvature, seen)[:6])
+        walls = Walls(laser, up, sensor, up, confocal)
+        return list(trace(centre, normal, CELL, quadrature(2), walls, curvature, seen)[:6])
 
     given = (centre, normal, seen)
     assert alike(with_gradients(found, *given), plainly(with_gradients, found, *given))

@@ -89,7 +89,7 @@ class World:
         impossible: effects with which no surfel survives a rebuild.
         when_fine: what the pool says of terms beside a fine scene, where that is something else.
         misfit: nats that every scene leaves of select spots. taken_up: of the fitted spots, fewer.
-        imitated: effects that scenes imitate.
+        imitated: effects that scenes imitate, of each kind.
     """
 
     def __init__(
@@ -105,9 +105,9 @@ class World:
         taken_up: float = 0.0,
         lost: dict[str, float] | None = None,
         when_fine: dict[str, float] | None = None,
-        imitated: tuple[str, ...] = (),
+        imitated: tuple[tuple[str, ...], ...] = (),
     ) -> None:
-        monkeypatch.setattr(loop, "IMITATED", frozenset(imitated))
+        monkeypatch.setattr(loop, "IMITATED", [frozenset(names) for names in imitated])
         self.when_fine = when_fine or {}
         self.table, self.pool, self.own, self.impossible = table, pool, own or {}, impossible
         self.beside, self.rivals, self.lost = beside or {}, rivals or {}, lost or {}
@@ -306,7 +306,7 @@ def test_a_scene_is_begun_with_what_scenes_imitate(monkeypatch, gained, begun):
     table = {"fine": nats(20.0), "anew+ambient_map+irf_tail": nats(gained), "irf_tail": nats(9.0)}
     table |= {"fine+anew+ambient_map+irf_tail": nats(99.0), "fine+anew+irf_tail": nats(99.0)}
     own = {"irf_tail": 50.0, "ambient_map": 1.0}
-    world = World(monkeypatch, table, pool, own, imitated=("irf_tail", "ambient_map"))
+    world = World(monkeypatch, table, pool, own, imitated=(("irf_tail", "ambient_map"),))
     found = world.criticise()
     assert world.rebuilt[0] == ({"irf_tail", "ambient_map"}, 4)
     assert names_of(found.members) == (["irf_tail", "ambient_map"] if begun else [])
@@ -314,12 +314,22 @@ def test_a_scene_is_begun_with_what_scenes_imitate(monkeypatch, gained, begun):
     assert len(found.pools) == (3 if begun else 1)
 
 
+@pytest.mark.parametrize(("gained", "taken"), [(30.0, "irf_tail"), (50.0, "wall_scale")])
+def test_of_the_kinds_that_scenes_imitate_the_better_one_is_begun_with(monkeypatch, gained, taken):
+    pool = [candidate("irf_tail", 0.0), candidate("wall_scale", 0.0)]
+    table = {"anew+irf_tail": nats(40.0), "anew+wall_scale": nats(gained)}
+    world = World(monkeypatch, table, pool, imitated=(("irf_tail",), ("pile_up",), ("wall_scale",)))
+    scene, members = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, []))
+    assert scene.names == {taken} == set(names_of(members))
+    assert [names for names, _ in world.rebuilt] == [{"irf_tail"}, {"wall_scale"}]
+
+
 def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):
     """More than half of what it had beside the base; and it takes the place of what predicts less."""
     pool = [candidate("irf_tail", 0.0), candidate("pile_up", 50.0), candidate("hum", 50.0)]
     both = {"fine": nats(5.0), "anew+irf_tail": nats(30.0), "fine+anew+irf_tail": nats(60.0)}
     table = both | {"irf_tail": nats(20.0), "pile_up": nats(40.0)}
-    world = World(monkeypatch, table, pool, {"irf_tail": 50.0}, imitated=("irf_tail",))
+    world = World(monkeypatch, table, pool, {"irf_tail": 50.0}, imitated=(("irf_tail",),))
     ask = world.ask
 
     def asked(fit, *args):
@@ -349,7 +359,7 @@ def test_a_term_that_is_there_takes_no_second_place(monkeypatch):
 
 def test_where_no_surfel_survives_the_search_begins_with_the_base(monkeypatch):
     world = World(
-        monkeypatch, {}, [candidate("irf_tail", 0.0)], imitated=("irf_tail",), impossible=("irf_tail",)
+        monkeypatch, {}, [candidate("irf_tail", 0.0)], imitated=(("irf_tail",),), impossible=("irf_tail",)
     )
     assert not world.criticise().members
 
@@ -438,7 +448,7 @@ def test_what_something_unknown_does_is_not_put_down_to_effects(monkeypatch):
     pool = [candidate("free_rate", 400.0), candidate("irf_tail", 300.0), candidate("pile_up", 20.0)]
     for gained in (30.0, -3.0):
         table = {"free_rate": gaining(gained), "irf_tail": gaining(40.0, 1), "pile_up": gaining(-1.0)}
-        world = World(monkeypatch, table, pool, {"pile_up": 1.0}, imitated=("irf_tail",))
+        world = World(monkeypatch, table, pool, {"pile_up": 1.0}, imitated=(("irf_tail",),))
         found = world.criticise(CriticismSettings(processes=1, most=3))
         assert next(names for names, _ in world.rebuilt if names) == {"free_rate"}
         holding = {"free_rate", "irf_tail"} if gained > 0 else {"irf_tail"}

@@ -19,7 +19,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
-from nlos_lit.effects import build_effects
+from nlos_lit.effects import EFFECTS, build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import Hooks
 from nlos_lit.functional.surfel_graph import (
@@ -419,6 +419,36 @@ def test_light_that_is_missing_in_a_corner_alone_is_no_body(fitted, monkeypatch,
     assert (begin_bodies(model, grid, test, here) == 1) == found
     monkeypatch.setattr(growth, "dispersion", lambda scores: 25.0)
     assert begin_bodies(model, grid, test, here) == 0, "places that ask for less light do so as strongly"
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("time_offset", {"offset": 0.05}),
+        ("wall_scale", {"scale_x": 0.1, "scale_y": -0.1}),
+        ("retroreflection", {"falloff": 3.0}),
+        ("vignetting", {"strength": 0.8}),
+        ("gate_edges", {"start": 0.5}),
+        ("pile_up", {"detections": 0.5}),
+    ],
+)
+def test_places_are_asked_through_all_effects(fitted, name, values):
+    """The score of a place is the derivative of the likelihood by the albedo of a surfel there."""
+    capture, held, _, _, result = fitted
+    train = torch.from_numpy(np.flatnonzero(~held))
+    counts = torch.from_numpy(capture.gated_counts())[train]
+    built = EFFECTS.named(name)(Scan.of(capture))
+    built.set_all(values)
+    model, hooks = SurfelModel.from_state(capture, result.model.state_dict()), Extension([built])
+    test = PlaceTest(model, capture, train, counts, model.expected(train, hooks), hooks)
+    here = torch.tensor([5, len(model) // 2])
+    albedo = model.albedo().detach().requires_grad_()
+    arriving = model.transients(model.paths(train, hooks), train, hooks, albedo)
+    by = model.record(arriving, train, hooks)[:, model.gate[0] :]
+    likelihood = (torch.xlogy(counts, by) - by).sum()
+    true = torch.autograd.grad(likelihood, albedo)[0][here]
+    found = test.surfels().score[here]
+    assert found.numpy() == pytest.approx(true.numpy(), rel=0.02, abs=0.02 * float(true.abs().max()))
 
 
 def test_candidates_keep_apart():
