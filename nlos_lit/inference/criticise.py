@@ -249,8 +249,8 @@ class Loop:
 
         Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
         are also built with all effects of each kind that scenes imitate, at their nulls, from the first
-        surfel on. The best is taken where it surely predicts better than the fine scene without any, which
-        has more surfels. Where there are no such effects they are a burden.
+        surfel on. The best is taken where it surely predicts better than the base, and, when it has become as
+        fine, than the fine scene without any. Where there are no such effects they are a burden.
 
         Args:
             base: without effects, parsimonious.
@@ -261,8 +261,8 @@ class Loop:
             the scene, and the effects that it has.
         """
         found = [(base, list[Member]())]
-        for kind, names in enumerate(IMITATED):
-            members = [Member(c) for c in pool.candidates if c.name in names]
+        for kind, imitated in enumerate(IMITATED):
+            members = [Member(c) for c in pool.candidates if c.name in imitated]
             if not members:
                 continue
             extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
@@ -272,7 +272,10 @@ class Loop:
             self.steps.plan(fit=1)
             text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
             fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
-            if fit.extension.effects and self.predicts(fit, fine, SURE):
+            if not fit.extension.effects or not self.predicts(fit, base, SURE):
+                continue
+            names = "_".join(m.name for m in members)
+            if self.predicts(self.better(self.fine(fit, f"begun_with_{names}"), fit), fine, SURE):
                 found.append((fit, members))
         best = self.better(*(fit for fit, _ in found))
         return next(one for one in found if one[0] is best)
