@@ -57,7 +57,8 @@ class SurfelSettings:
             finer where that predicts more …
         most: … and makes no more surfels than this.
         quadrature: points along each side of a surfel; None spaces their arrivals by about two bins.
-        contest: batches in which seeds and response stand still, and albedos and effects are fitted.
+        contest: batches in which seeds and response stand still, and albedos and effects are fitted, but for
+            those that move light in time.
         rounds: in which sheets are found; between them surfels die and grow one by one.
         outlines: rounds that follow, before which sheets are extended all around and cut back.
         steps: batches a round; the last has twice as many.
@@ -126,7 +127,8 @@ class Round:
     Args:
         steps: batches.
         left: rounds that follow by plan; the last one cools down.
-        settling: it comes from seeds; the response and the shapes of effects wait for their places.
+        settling: it comes from seeds; the response, what moves light in time and the shapes of effects wait
+            for their places.
         contest: surfels and response stand still; those that come out faint are left out afterwards.
         parts: into which each side of a surfel is divided before it, if ``most`` surfels allow it.
         grow: surfels die and grow before it, one by one.
@@ -521,11 +523,14 @@ class SurfelFit:
         return any(now.outline or now.onward for now in self.plan[:1])
 
     def _effect_parameters(self) -> list[torch.nn.Parameter]:
-        """Those that a round fits: where a disc is, or how late an echo, waits for the scene to settle."""
+        """Those that a round fits: where a disc is, or how late an echo, waits for the scene to settle, as
+        does all that moves light in time: it would settle around errors of the seeds.
+        """
         still = self.plan[0].settling
         return [
             getattr(effect, f"raw_{p.name}")
             for effect in self.extension.effects
+            if not (still and effect.stage == "time")
             for p in (effect.amplitudes if still else effect.declared.values())
         ]
 

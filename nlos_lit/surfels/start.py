@@ -85,7 +85,7 @@ def seed_surfels(
     candidates, value = volume_maxima(intensity, grid, RESERVE * s.floor, s.per_cell, lateral)
     null = rank_one(counts)[tested]
     asked = (counts[tested] / null - 1, 1 / null)
-    scores = score(candidates, capture, lateral.pitch, 1, sensor, asked, train[tested])
+    scores = score(candidates, capture, lateral.pitch, 1, sensor, asked, train[tested], extension)
     significance = scores.significance * math.sqrt(len(train) / len(tested))
     keep = (significance > s.significance) & (value >= s.floor)
     if int(keep.sum()) > s.max_seeds:

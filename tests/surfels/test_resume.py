@@ -149,6 +149,22 @@ def test_shapes_of_effects_wait_for_the_places():
     assert seen == [(False, True), (True, True)]
 
 
+def test_what_moves_light_in_time_waits_for_the_places():
+    """Fitted to seeds it would take up how far these are off."""
+    fit = begun()
+    fit.extension = Extension([effect_of("wall_scale", Scan.of(fit.capture)), *fit.extension.effects])
+    fit.schedule([Round(4, left=1, settling=True), Round(4)])
+    scale, seen = fit.extension.effects[0], []
+    while not fit.finished:
+        fit.begin_round()
+        before = scale.raw_scale_x.item()
+        while not fit.round_done:
+            fit.step()
+        seen.append(scale.raw_scale_x.item() != before)
+        fit.end_round()
+    assert seen == [False, True]
+
+
 def test_a_plan_is_the_rounds_in_order():
     settings = dataclasses.replace(SETTINGS, rounds=2, outlines=2, steps=10, contest=7)
     contest = Round(7, left=4, settling=True, contest=True)
