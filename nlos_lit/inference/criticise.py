@@ -578,7 +578,7 @@ class Loop:
             before = log_likelihood(fit, select)
             gain, weight, explained = self._gained(fit, before, value)
             evidence, needed, shared = own[member.name]
-            confirmed = Confirmed(evidence, needed, gain, weight, explained, shared)
+            confirmed = Confirmed(evidence, needed, gain, weight, explained, shared, self.least)
             none = Trial(None, fit, before, compare(before, before, self.block))
             trials = [Trial(member.candidate, whole, value, gain), none]
             holds = confirmed.holds(member.candidate)
@@ -685,7 +685,9 @@ class Loop:
             none = next(t for t in member.trials if t.candidate is None)
             gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
             evidence, needed, shared = own[member.name]
-            confirmed[member.name] = replace(member, confirmed=Confirmed(evidence, needed, *gained, shared))
+            confirmed[member.name] = replace(
+                member, confirmed=Confirmed(evidence, needed, *gained, shared, self.least)
+            )
         return [confirmed.get(m.name, m) for m in settled], scene
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:

@@ -54,6 +54,7 @@ class Confirmed:
         weight: how far the capture leaves open that it predicts better than that one.
         explained: share of what the select spots leave unexplained without it.
         shared: of what is needed, nats for what other terms take from it.
+        chance: of what is needed, nats that one of all terms has where nothing is wrong.
     """
 
     evidence: float
@@ -62,6 +63,7 @@ class Confirmed:
     weight: float
     explained: float = 0.0
     shared: float = 0.0
+    chance: float = 0.0
 
     @property
     def much(self) -> bool:
@@ -110,9 +112,11 @@ class Member:
 
     @property
     def likely(self) -> bool:
-        """It does not hold, although spots that were not fitted are predicted much better with it."""
-        known = not self.accepted and not self.gone
-        return known and self.confirmed is not None and self.confirmed.much
+        """It does not hold, although it is asked for by more than chance, and spots that were not fitted are
+        predicted much better with it: what a scene has bent itself to is missed by these, too.
+        """
+        known, c = not self.accepted and not self.gone, self.confirmed
+        return known and c is not None and c.much and c.evidence > c.chance
 
     @property
     def stands_in(self) -> bool:

@@ -557,12 +557,15 @@ def test_an_effect_must_predict_other_spots(monkeypatch, errors, accepted):
     assert world.hold("irf_tail")[0]["irf_tail"].accepted is accepted
 
 
-@pytest.mark.parametrize(("gain", "told"), [(10.1, True), (9.9, False)])
-def test_what_is_predicted_much_better_is_told(monkeypatch, gain, told):
-    """A quarter of what 120 spots leave unexplained: 40 nats of 100 for 300. That names nothing."""
-    world = World(
-        monkeypatch, {"irf_tail": nats(gain)}, [candidate("irf_tail")], {"irf_tail": 1.0}, misfit=100.0
-    )
+@pytest.mark.parametrize(
+    ("gain", "more", "told"), [(10.1, 0.1, True), (9.9, 0.1, False), (10.1, -0.1, False)]
+)
+def test_what_is_predicted_much_better_is_told(monkeypatch, gain, more, told):
+    """A quarter of what 120 spots leave unexplained: 40 nats of 100 for 300. That names nothing, and it must
+    be asked for by more than chance.
+    """
+    own = {"irf_tail": LEAST + more}
+    world = World(monkeypatch, {"irf_tail": nats(gain)}, [candidate("irf_tail")], own, misfit=100.0)
     found, _ = world.hold("irf_tail")
     assert found["irf_tail"].confirmed.explained == pytest.approx(gain / 40, abs=1e-6)
     assert (found["irf_tail"].accepted, found["irf_tail"].likely) == (False, told)
