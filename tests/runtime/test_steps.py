@@ -161,8 +161,8 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
         if text.startswith("rebuilding the scene"):
             raise KeyboardInterrupt
 
-    whole, _ = diagnose(scene, Pipeline(scene), options, name="x", seed=0)
-    first, second = Pipeline(scene), Pipeline(scene)
+    once, first, second = (Pipeline(scene) for _ in range(3))
+    whole, _ = diagnose(scene, once, options, name="x", seed=0)
     with pytest.raises(KeyboardInterrupt):
         diagnose(scene, first, options, name="x", seed=0, folder=tmp_path, report=interrupt)
     assert texts[:3] == ["imaging", "fitting the base", "refining the scene without effects"]
@@ -171,9 +171,10 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
         scene, second, options, name="x", seed=0, folder=tmp_path, report=lambda text, *_: said.append(text)
     )
     assert said[0].startswith("rebuilding the scene")
-    begun = ("retroreflection", "irf_tail", "wall_reflectance", "ambient_map")
-    assert first.seeds == [(0, (), False), (0, (), True), (0, begun, False)]
-    assert not set(first.seeds) & set(second.seeds), "nothing is fitted again"
-    assert all(len(names) == 1 for _, names, fine in second.seeds if not fine)
+    light = ("retroreflection", "irf_tail", "wall_reflectance", "ambient_map")
+    geometry = ("wall_tilt", "wall_scale", "laser_sensor_baseline", "time_offset", "clock_scale")
+    begun = [(0, names, fine) for names in (light, geometry) for fine in (False, True)]
+    assert first.seeds == [(0, (), False), (0, (), True), *begun]
+    assert first.seeds + second.seeds == once.seeds, "nothing is fitted again"
     same = [dataclasses.asdict(dataclasses.replace(d, seconds=0.0, profiles=[])) for d in (whole, again)]
     np.testing.assert_equal(*same)
