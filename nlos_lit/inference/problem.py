@@ -124,7 +124,7 @@ def build_problem(
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
     for part in spots.split(size):
         with torch.no_grad():
-            light.append(model.transients(model.paths(part, extension), part, extension))
+            light.append(model.arrived(part, extension))
         surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
         both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
@@ -264,11 +264,12 @@ def _staged(
         paths = None if "walls" in effect.hooks else model.paths(spots, extension)
 
         def render(m: SurfelModel, e: Extension) -> Tensor:
-            return m.record(m.transients(m.paths(spots, e) if paths is None else paths, spots, e), spots, e)
+            arrived = m.arrived(spots, e) if paths is None else m.transients(paths, spots, e)
+            return m.record(arrived, spots, e)
 
         return _Forward(model, extension, render)
     if transients is None:
-        transients = model.transients(model.paths(spots, extension), spots, extension)
+        transients = model.arrived(spots, extension)
     if effect.stage == "response":
         return _recording(model, extension, spots, transients)
     signal = model.signal(transients, extension)

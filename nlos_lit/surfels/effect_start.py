@@ -58,9 +58,7 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
     """
 
     def arriving() -> Tensor:
-        return torch.cat(
-            [model.transients(model.paths(part, extension), part, extension) for part in spots.split(32)]
-        )
+        return torch.cat([model.arrived(part, extension) for part in spots.split(32)])
 
     def expected(effect: Effect, light: Tensor) -> Tensor:
         transients = arriving() if effect.needs_paths else light

@@ -436,6 +436,19 @@ class SurfelModel(nn.Module):
         transients = SplineSplat.apply(energy.flatten(1), time.flatten(1), self.n_bins)
         return hooks.transients(transients, energy, paths, spots)
 
+    def arrived(self, spots: Tensor, hooks: Hooks, placed: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Stages 1 to 3.
+
+        Args:
+            spots: ``[B]`` rows of the capture.
+            hooks: effects that act on walls, paths, times and transients.
+            placed: from :meth:`placed`, where it is known.
+
+        Returns:
+            ``[B, T]`` as of :meth:`transients`.
+        """
+        return self.transients(self.paths(spots, hooks, placed), spots, hooks)
+
     def arrivals(self, paths: Paths, spots: Tensor, hooks: Hooks, albedo: Tensor) -> tuple[Tensor, Tensor]:
         """Stage 2: energy of each path, and when it arrives.
 
@@ -520,8 +533,7 @@ class SurfelModel(nn.Module):
         Returns:
             ``[B, T_gate]`` expected counts.
         """
-        transients = self.transients(self.paths(spots, hooks, placed), spots, hooks)
-        return self.record(transients, spots, hooks)[:, self.gate[0] :]
+        return self.record(self.arrived(spots, hooks, placed), spots, hooks)[:, self.gate[0] :]
 
     forward = render
 
@@ -553,7 +565,7 @@ class SurfelModel(nn.Module):
         """
         found = []
         for part, of_counts in zip(self._batches(spots), self._batches(spots, asked), strict=True):
-            signal = self.signal(self.transients(self.paths(part, hooks), part, hooks), hooks)
+            signal = self.signal(self.arrived(part, hooks), hooks)
             with torch.enable_grad():
                 counted = self.detect(signal.requires_grad_(), part, hooks)[:, self.gate[0] :]
                 by = [(counted * of_counts).sum(), counted.sum()]
@@ -573,9 +585,7 @@ class SurfelModel(nn.Module):
             ``[B, T_gate]`` counts.
         """
         parts = self._batches(spots)
-        signals = [
-            hooks.gain(self.signal(self.transients(self.paths(p, hooks), p, hooks), hooks), p) for p in parts
-        ]
+        signals = [hooks.gain(self.signal(self.arrived(p, hooks), hooks), p) for p in parts]
         return torch.cat(signals)[:, self.gate[0] :]
 
     def _batches(self, spots: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
