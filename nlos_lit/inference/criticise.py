@@ -194,6 +194,7 @@ class Standing(NamedTuple):
     gone: dict[str, Member]  # by name
     scene: SurfelFit
     coarse: SurfelFit | None  # as Loop.hold takes it
+    asked: bool = False  # all who stay have been, beside scenes that were built without them, too
 
 
 class Loop:
@@ -244,8 +245,8 @@ class Loop:
         text = "asking single spots" if of_spots else "asking the pool"
         return self.steps("screen", f"{text}, {self.number}", f"pool{self.number}", asking)
 
-    def begun(self, base: SurfelFit, fine: SurfelFit, pool: Pool) -> tuple[SurfelFit, list[Member]]:
-        """The parsimonious scene that the search begins with.
+    def begun(self, base: SurfelFit, fine: SurfelFit, pool: Pool) -> Held:
+        """What the search begins with.
 
         Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
         are also built with all effects of each kind that scenes imitate, at their nulls, from the first
@@ -258,9 +259,9 @@ class Loop:
             pool: what the counts ask for beside the base.
 
         Returns:
-            the scene, and the effects that it has.
+            the effects that are there, and the scenes with them; nobody was asked whether they hold.
         """
-        found = [(base, list[Member]())]
+        found = [Held([], fine, base)]
         for kind, imitated in enumerate(IMITATED):
             members = [Member(c) for c in pool.candidates if c.name in imitated]
             if not members:
@@ -274,11 +275,11 @@ class Loop:
             fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
             if not fit.extension.effects or not self.predicts(fit, base, SURE):
                 continue
-            names = "_".join(m.name for m in members)
-            if self.predicts(self.better(self.fine(fit, f"begun_with_{names}"), fit), fine, SURE):
-                found.append((fit, members))
-        best = self.better(*(fit for fit, _ in found))
-        return next(one for one in found if one[0] is best)
+            grown = self.grown(fit, f"begun_with_{'_'.join(m.name for m in members)}")
+            if self.predicts(grown, fine, SURE):
+                found.append(Held(members, grown, fit))
+        best = self.better(*(one.coarse for one in found))
+        return next(one for one in found if one.coarse is best)
 
     def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
         """A scene built with the effects, or the base, where no surfel survives with them."""
@@ -356,6 +357,10 @@ class Loop:
         text, kept = f"refining the scene {name.replace('_', ' ')}", f"fine{self.number}_{name}"
         return self.steps("fit", text, kept, lambda: solve_spots(self.grow(fit, self.seed)))
 
+    def grown(self, coarse: SurfelFit, name: str) -> SurfelFit:
+        """The scene as fine as the counts ask for, or the parsimonious one, whichever predicts better."""
+        return self.better(self.fine(coarse, name), coarse)
+
     def hold(
         self,
         members: list[Member],
@@ -372,7 +377,8 @@ class Loop:
         parsimonious scenes. Effects with which other spots are surely predicted better stay in the scene,
         however little they are asked for: what they explain would stand against all others as misfit. But
         where one lacks only what others take, those that are missed least leave, one after the other, as they
-        may share what one of them does. If fewer hold then than before, they stay.
+        may share what one of them does. If fewer hold then than before, they stay, or if no more do and other
+        spots are surely predicted better with them.
 
         Args:
             members: whose terms the scene has.
@@ -387,11 +393,16 @@ class Loop:
         """
         start = Standing(list(members), {}, scene, coarse)
         end, whole = self._left(start, before, apart=True)
-        if whole is not None and _named(end.staying) < _named(whole.staying):
-            together, _ = self._left(whole, before, apart=False)
-            end = together if _named(together.staying) > _named(end.staying) else end
+        if whole is not None and self._in_vain(end, whole):
+            together = whole if whole.asked else self._left(whole, before, apart=False)[0]
+            end = together if self._in_vain(end, together) else end
         now = {m.name: m for m in end.staying} | end.gone
         return [now[m.name] for m in members], end.scene, end.coarse
+
+    def _in_vain(self, apart: Standing, together: Standing) -> bool:
+        """Look-alikes left in vain: fewer hold, or no more, and others are surely predicted worse."""
+        more = _named(apart.staying) - _named(together.staying)
+        return more < 0 or (more == 0 and self.predicts(together.scene, apart.scene, SURE))
 
     def _left(self, now: Standing, before: Held | None, apart: bool) -> tuple[Standing, Standing | None]:
         """Who is left when nobody has to leave any more.
@@ -404,22 +415,23 @@ class Loop:
         Returns:
             That, and how it stood when the first look-alike left, if one did.
         """
-        (staying, away, scene, coarse), whole = now, None
+        (staying, away, scene, coarse, _), whole = now, None
 
-        def leaving() -> list[Member]:
+        def leaving(anew: bool) -> list[Member]:
             nonlocal whole
             gone = _leaving(staying, enough)
             if not gone and apart and (gone := _sharing(staying)):
-                whole = whole or Standing(staying, away, scene, coarse)
+                whole = whole or Standing(staying, away, scene, coarse, anew)
             return gone
 
         while staying:
+            without = dict[str, tuple[SurfelFit, SurfelFit | None]]()
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
-            gone = leaving()
+            gone = leaving(anew=coarse is None)
             if not gone and coarse is not None:
-                staying = self._anew(staying, coarse, scene)
-                gone = leaving()
+                staying, without = self._anew(staying, coarse, scene)
+                gone = leaving(anew=True)
             if not gone:
                 break
             away = away | {m.name: replace(m, gone=True) for m in gone}
@@ -430,8 +442,11 @@ class Loop:
                 scene, coarse = before.scene, before.coarse
             else:
                 names = [m.name for m in [*before.members, *staying]]
-                coarse = self.built_with(coarse, names)
-                scene = self.better(self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
+                left = ",".join(m.name for m in gone)  # alone it may have been built without
+                coarse, fine = without.get(left) or (self.built_with(coarse, names), None)
+                if fine is None:
+                    fine = self.fine(coarse, f"with_{'_'.join(names)}")
+                scene = self.better(fine, coarse)
         return Standing(staying, away, scene, coarse), whole
 
     def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
@@ -471,7 +486,7 @@ class Loop:
             return start
         staying = start.members + more
         coarse = self.built_with(effects.coarse, [m.name for m in staying])
-        return Held(staying, self.better(self.fine(coarse, "with_those_that_do_more"), coarse), coarse)
+        return Held(staying, self.grown(coarse, "with_those_that_do_more"), coarse)
 
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""
@@ -480,7 +495,9 @@ class Loop:
             return next(fit for member, fit in asked if member.name == names[0])
         return self._parted(scene, names, f"left{self.number}_{'_'.join(names)}")
 
-    def _anew(self, members: list[Member], coarse: SurfelFit, scene: SurfelFit) -> list[Member]:
+    def _anew(
+        self, members: list[Member], coarse: SurfelFit, scene: SurfelFit
+    ) -> tuple[list[Member], dict[str, tuple[SurfelFit, SurfelFit | None]]]:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
@@ -495,10 +512,12 @@ class Loop:
             scene: the one that they hold beside.
 
         Returns:
-            the same members.
+            The same members, and by name the scenes that were built without them: parsimonious, and fine
+            where it was asked.
         """
         names = [m.name for m in members]
         value, found = log_likelihood(coarse, self.split.select), []
+        built = dict[str, tuple[SurfelFit, SurfelFit | None]]()
         self.steps.plan(fit=sum(m.accepted for m in members))
         for member in members:
             if not member.accepted:
@@ -515,14 +534,16 @@ class Loop:
                 old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
             )
             free, per_spot = member.candidate.free, member.candidate.effect.per_spot
+            built[member.name] = fit, None
             if now.holds(member.candidate) and not per_spot and not (free and now.much):
                 self.steps.plan(fit=1, screen=1)
                 fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
+                built[member.name] = fit, fine
                 if not self._accounts(now.evidence, scene, fine):
                     evidence = self._beside(fine, member.name, kept)
                     now = replace(now, evidence=min(evidence, now.evidence))
             found.append(replace(member, confirmed=now, accepted=now.holds(member.candidate)))
-        return found
+        return found, built
 
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
         """A term of a scene accounts for most of the misfit of a fine one without it.
@@ -816,11 +837,12 @@ def criticise(
     """
     loop = Loop(rebuild, grow, split, scan, s, seed, steps or Steps())
     first = loop.fine(base, "without_effects")
-    found, held, coarse = Findings(first, first, loop.needed(first)), Held([], first, base), base
+    found, coarse = Findings(first, first, loop.needed(first)), base
+    held = begun = Held([], first, base)
     told(first, first, [])
 
     def asked(effects: bool) -> Pool:
-        found.pools.append(loop.ask(coarse, s.most - len(found.members), effects))
+        found.pools.append(loop.ask(coarse, s.most - len(coarse.extension.effects), effects))
         return found.pools[-1]
 
     pool = asked(effects=True)
@@ -840,7 +862,7 @@ def criticise(
         """What holds of those that came, beside what is held."""
         if not new:
             return beside
-        grown = loop.better(loop.fine(coarse, "with_all"), coarse)
+        grown = begun.scene if coarse is begun.coarse else loop.grown(coarse, "with_all")
         tried, scene, left = loop.hold(new, grown, coarse, beside)
         now = {m.name: m for m in tried}
         found.members = [now.get(m.name, m) for m in found.members]
@@ -862,10 +884,11 @@ def criticise(
         rivals = [c for c in lost(before.candidates, pool.candidates, loop.least) if c.free]
         held = with_those([Member(leads, rivals)], held)
         if not held.members:
-            held, coarse, pool, found.members = Held([], first, base), base, before, []
+            held, coarse, pool, found.members = begun, base, before, []
     start, new = held, list[Member]()
     if not start.members:
-        coarse, new = loop.begun(base, first, pool)
+        begun = loop.begun(base, first, pool)
+        coarse, new = begun.coarse, begun.members
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)

@@ -314,6 +314,7 @@ def test_a_scene_is_begun_with_what_scenes_imitate(monkeypatch, coarse, gained, 
     assert names_of(found.members) == (["irf_tail", "ambient_map"] if begun else [])
     assert names_of(found.accepted) == (["irf_tail"] if begun else [])
     assert len(found.pools) == (3 if begun else 1)
+    assert world.grown.count({"irf_tail", "ambient_map"}) == (coarse >= 3.0), "not again when they are asked"
 
 
 @pytest.mark.parametrize(("gained", "taken"), [(30.0, "irf_tail"), (50.0, "wall_scale")])
@@ -321,8 +322,8 @@ def test_of_the_kinds_that_scenes_imitate_the_better_one_is_begun_with(monkeypat
     pool = [candidate("irf_tail", 0.0), candidate("wall_scale", 0.0)]
     table = {"anew+irf_tail": nats(40.0), "anew+wall_scale": nats(gained)}
     world = World(monkeypatch, table, pool, imitated=(("irf_tail",), ("pile_up",), ("wall_scale",)))
-    scene, members = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, []))
-    assert scene.names == {taken} == set(names_of(members))
+    members, scene, coarse = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, []))
+    assert scene.names == coarse.names == {taken} == set(names_of(members))
     assert [names for names, _ in world.rebuilt] == [{"irf_tail"}, {"wall_scale"}]
 
 
@@ -404,6 +405,9 @@ def test_free_terms_come_beside_the_effects_that_hold(monkeypatch):
         assert world.grown[:3] == [set(), {"irf_tail", "pile_up"}, {"irf_tail"}]
         assert world.grown[3:] == [set(), {"irf_tail", "free_time"}], "without it once, and not again"
         assert world.asked == [["irf_tail", "pile_up"], ["irf_tail"], ["free_time"]]
+        world.asked.clear()
+        world.criticise(CriticismSettings(processes=1, most=2))
+        assert world.asked[-1] == ["free_time"], "who has left makes room"
 
 
 @pytest.mark.parametrize("gained", [30.0, -3.0])
@@ -639,8 +643,7 @@ def test_where_one_lacks_only_what_others_take_the_one_that_is_missed_least_leav
     assert scene.names == (named or {*table})
 
 
-@pytest.mark.parametrize("beside", [True, False])
-def test_what_lacks_only_what_others_take_stays_where_one_that_holds_needs_it(monkeypatch, beside):
+def test_what_lacks_only_what_others_take_stays_where_one_that_holds_needs_it(monkeypatch):
     """Without the wall, which other spots want, the tail has less than it needs: what it did is misfit."""
     table = {"irf_tail": nats(99.0), "wall_reflectance": nats(9.0)}
     own, lost = {"irf_tail": 2 * LEAST, "wall_reflectance": LEAST + 0.1}, {"wall_reflectance": 400.0}
@@ -648,14 +651,38 @@ def test_what_lacks_only_what_others_take_stays_where_one_that_holds_needs_it(mo
     told = world.own_evidence
 
     def asked(fit, split, most, seed, names, bar):
-        world.own["irf_tail"] = 2 * LEAST if beside or len(names) == 2 else 0.5 * LEAST
+        world.own["irf_tail"] = 2 * LEAST if len(names) == 2 else 0.5 * LEAST
         return told(fit, split, most, seed, names, bar)
 
     monkeypatch.setattr(loop, "own_evidence", asked)
     found, scene = world.hold(*table)
-    assert {n for n, m in found.items() if m.accepted} == {"irf_tail"}
-    assert [m.gone for m in found.values()] == [False, beside]
-    assert scene.names == ({"irf_tail"} if beside else {*table})
+    assert {n: (m.accepted, m.gone) for n, m in found.items()} == {
+        "irf_tail": (True, False),
+        "wall_reflectance": (False, False),
+    }
+    assert scene.names == {*table}
+
+
+@pytest.mark.parametrize(("alone", "stays"), [(105.0, True), (105.1, False)])
+@pytest.mark.parametrize("late", [True, False])
+def test_look_alikes_stay_where_nobody_holds_for_their_leaving(monkeypatch, late, alone, stays):
+    """The tail holds with the wall and without it. Other spots decide: with both they have 108 nats, and
+    ln(19) more are sure. What the wall lacks shows at once, or beside a fine scene without it (late).
+    """
+    both, few = {"irf_tail", "wall_reflectance"}, LEAST + 0.1
+    table = {"irf_tail": nats(99.0), "wall_reflectance": nats(9.0), "fine+anew+irf_tail": nats(alone)}
+    own = {"irf_tail": 2 * LEAST, "wall_reflectance": few + 100 * late}
+    lost, when_fine = {"wall_reflectance": 400.0}, {"wall_reflectance": few}
+    pool = [candidate(n) for n in sorted(both)]
+    world = World(monkeypatch, table, pool, own, lost=lost, when_fine=when_fine)
+    members, before = [Member(c) for c in pool], Held([], fitted(fine=True), fitted())
+    found, scene, coarse = world.loop().hold(members, fitted(*both, fine=True), fitted(*both), before)
+    assert [(m.accepted, m.stays, m.gone) for m in found] == [(True, True, False), (False, stays, not stays)]
+    assert scene.names == coarse.names == (both if stays else {"irf_tail"})
+    again = [sorted(both)] if stays and not late else []
+    assert world.asked == [sorted(both), ["irf_tail"], *again], "whoever was asked in every way is not again"
+    alone = world.grown.count({"irf_tail"}), [names for names, _ in world.rebuilt].count({"irf_tail"})
+    assert alone == (1, 1), "the scene without the wall is built once"
 
 
 def test_of_two_that_stand_for_each_other_one_leaves(monkeypatch):
