@@ -1,4 +1,4 @@
-"""Second, weak laser pulse."""
+"""Echoes of the pulse: a reflection, and its own reflections."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import whole_record
+from nlos_lit.functional.delays import convolve, whole_record
 
 
 class GhostPulse(Effect):
-    """A copy of the response follows, from a reflection in the optics, in a cable or in the laser.
+    """Copies of the response follow, from a reflection in the optics, in a cable or in the laser.
 
-    ``Ψ'(t) = Ψ(t) + fraction · Ψ(t - delay)``; between whole bins Ψ is interpolated linearly.
+    ``Ψ'(t) = Ψ(t) + fraction · Σ_{k≥1} again^{k-1} Ψ(t - k delay)``; what goes to and fro between two ends
+    loses the same share each time. Between whole bins Ψ is interpolated linearly.
 
-    Parameters: ``fraction`` (1), null 0. ``delay`` (m of path), scanned from 4 bins to 0.6 of the record.
+    Parameters: ``fraction`` (1) of the first echo, null 0. ``delay`` (m of path), scanned from 4 bins to 0.6
+    of the record. ``again`` (1) of each echo over the one before; 0 is a single echo.
 
     Signature: the whole record again, weaker and later, at every spot by the same delay.
 
@@ -25,7 +27,8 @@ class GhostPulse(Effect):
     the tail.
 
     Source: W. Becker, *The bh TCSPC Handbook* (optical and electrical reflections in the instrument
-    response).
+    response); the series is that of any two partly reflecting ends (M. Born, E. Wolf, *Principles of Optics*,
+    §7.6).
     """
 
     name = "ghost_pulse"
@@ -33,10 +36,10 @@ class GhostPulse(Effect):
     words = EffectWords(
         phrase="a second, delayed pulse",
         cause="A reflection in the optics or a cable, or a post-pulse of the laser, repeats every return "
-        "later.",
+        "later, and may come again.",
         remedy="Look for the repeat in the direct pulse; tilt filters and windows, terminate cables, or "
         "move it out of the gate.",
-        headline="{fraction} of the main pulse, {delay} later",
+        headline="{fraction} of the main pulse, {delay} later, and {again} of each echo again",
     )
 
     @classmethod
@@ -49,6 +52,7 @@ class GhostPulse(Effect):
         return (
             Parameter("fraction", "1", 0.0, 0.05, 0.0, 1.0, kind="percent"),
             Parameter("delay", "m", None, scan.bin_length, scan.bin_length, longest, grid=tuple(delays)),
+            Parameter("again", "1", None, 0.1, 0.0, 0.9, grid=(0.2,), kind="percent"),
         )
 
     @classmethod
@@ -58,7 +62,11 @@ class GhostPulse(Effect):
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
         delay = self.value("delay") / self.scan.bin_length
-        whole = int(delay.detach())
-        part = delay - whole
-        late, later = (torch.nn.functional.pad(kernel, (n, 0))[: len(kernel)] for n in (whole, whole + 1))
-        return kernel + self.value("fraction") * ((1 - part) * late + part * later)
+        number = torch.arange(1, 1 + int(len(kernel) / delay.detach()), device=kernel.device)
+        at, size = number * delay, self.value("again").reshape(1) ** (number - 1)
+        whole = at.detach().long()
+        train = torch.zeros_like(at[:1]).expand(len(kernel) + 2)
+        train = train.index_add(0, whole, size * (1 + whole - at)).index_add(
+            0, whole + 1, size * (at - whole)
+        )
+        return kernel + self.value("fraction") * convolve(kernel, train[: len(kernel)])

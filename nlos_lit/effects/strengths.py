@@ -73,7 +73,7 @@ def report(effects: Iterable[Effect]) -> dict[str, dict[str, dict[str, float | s
 
 @torch.no_grad()
 def bound_notes(effects: Iterable[Effect]) -> list[str]:
-    """Sentences on fitted parameters that lie at a bound which is not their null.
+    """Sentences on fitted parameters that lie at a bound, but for their null, or 0 of a shape, which is none.
 
     What the counts ask for lies beyond: the effect's law may be another one than its equation.
 
@@ -89,7 +89,7 @@ def bound_notes(effects: Iterable[Effect]) -> list[str]:
             value = float(effect.value(p.name))
             for end, word in ((p.lower, "least"), (p.upper, "most")):
                 # Stored in single precision, as multiples of the scale or as the logarithm of them.
-                if end != p.null and math.isclose(value, end, rel_tol=1e-4):
+                if end not in (p.null, 0.0) and math.isclose(value, end, rel_tol=1e-4):
                     notes.append(
                         f"{p.name} of {effect.name} is {end:g}, the {word} that it may be: what the counts "
                         "ask for lies beyond, so that its equation may be another one than what acts"

@@ -35,15 +35,22 @@ def test_irf_tail_keeps_the_energy_and_delays_it():
     assert late[:5].abs().max().item() < 1e-6
 
 
-def test_ghost_pulse_stands_at_its_delay():
-    ghost = effect("ghost_pulse", fraction=0.2, delay=7.25 * BIN)
+def test_echoes_stand_at_their_delays():
+    """Each at a multiple of the delay, and less by the same share; what comes after the record is cut."""
     kernel = torch.zeros(6)
     kernel[2] = 1.0
-    doubled = ghost.response(kernel, 2).detach()
-    assert len(doubled) == 2 + LAST
-    expected = torch.zeros(2 + LAST)
-    expected[2], expected[9], expected[10] = 1.0, 0.2 * 0.75, 0.2 * 0.25
-    assert doubled == pytest.approx(expected, abs=1e-5)
+    for again in (0.0, 0.5):
+        ghost = effect("ghost_pulse", fraction=0.2, delay=7.25 * BIN, again=again)
+        found = ghost.response(kernel, 2).detach()
+        expected = torch.zeros(2 + LAST)
+        expected[2] = 1.0
+        for k in range(1, LAST // 7 + 1):
+            whole = int(7.25 * k)
+            for late, share in ((whole, whole + 1 - 7.25 * k), (whole + 1, 7.25 * k - whole)):
+                if late < LAST:
+                    expected[2 + late] += 0.2 * again ** (k - 1) * share
+        assert found == pytest.approx(expected, abs=1e-5)
+    assert expected[16:18] == pytest.approx([0.2 * 0.5 * 0.5, 0.2 * 0.5 * 0.5]), "the second, 14.5 bins late"
 
 
 def test_gains_of_spots():
@@ -421,10 +428,10 @@ def test_one_spot_is_enough():
 
 
 def test_numbers_that_lie_at_a_bound_are_told():
-    """Not those at their null, even where that is a bound (an entrance loss of 0)."""
+    """Not those at their null, even where that is a bound (an entrance loss of 0), nor of single echoes."""
     assert bound_notes([effect("retroreflection"), effect("irf_tail"), effect("wall_reflectance")]) == []
     inside = effect("retroreflection", falloff=1.51, cosine=2.99, entrance=7.9)
-    assert bound_notes([inside]) == []
+    assert bound_notes([inside, effect("ghost_pulse", fraction=0.1, again=0.0)]) == []
     beyond = effect("retroreflection", falloff=1.0, cosine=9.0, entrance=0.0)
     said = [note.split(":")[0] for note in bound_notes([beyond])]
     assert said == [
