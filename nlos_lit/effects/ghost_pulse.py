@@ -62,11 +62,11 @@ class GhostPulse(Effect):
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
         delay = self.value("delay") / self.scan.bin_length
-        number = torch.arange(1, 1 + int(len(kernel) / delay.detach()), device=kernel.device)
+        echoes = int(len(kernel) / delay.detach())
+        number = torch.arange(1, 1 + echoes, dtype=delay.dtype, device=delay.device)
         at, size = number * delay, self.value("again").reshape(1) ** (number - 1)
         whole = at.detach().long()
-        train = torch.zeros_like(at[:1]).expand(len(kernel) + 2)
-        train = train.index_add(0, whole, size * (1 + whole - at)).index_add(
-            0, whole + 1, size * (at - whole)
-        )
+        later = size * (at - whole.to(at))
+        train = torch.zeros_like(later[:1]).expand(len(kernel) + 2)
+        train = train.index_add(0, whole, size - later).index_add(0, whole + 1, later)
         return kernel + self.value("fraction") * convolve(kernel, train[: len(kernel)])

@@ -9,11 +9,12 @@ import math
 import numpy as np
 import pytest
 import torch
-from effect_contract import BIN, GATE, SPOTS, capture, registered, scene
+from effect_contract import BIN, GATE, SPOTS, away, capture, registered, scene
 from effect_hand import SPOT, effect, hand_scan
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
+from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.scan_pieces import lines
 from nlos_lit.effects.strengths import bound_notes
@@ -51,6 +52,32 @@ def test_echoes_stand_at_their_delays():
                     expected[2 + late] += 0.2 * again ** (k - 1) * share
         assert found == pytest.approx(expected, abs=1e-5)
     assert expected[16:18] == pytest.approx([0.2 * 0.5 * 0.5, 0.2 * 0.5 * 0.5]), "the second, 14.5 bins late"
+
+
+class Response(torch.nn.Module):
+    """What an effect makes of a response."""
+
+    def __init__(self, changing: Effect) -> None:
+        super().__init__()
+        self.effect = changing
+
+    def forward(self, kernel: torch.Tensor) -> torch.Tensor:
+        return self.effect.response(kernel, 2)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
+@pytest.mark.parametrize("name", [e.name for e in EFFECTS if "response" in e(scene("confocal")[1]).hooks])
+def test_responses_are_derived_in_single_precision(name):
+    """As the pool derives them: whole numbers times a dual number would be one of double precision."""
+    kernel, changing = torch.rand(6), Response(away(effect(name)))
+    for p in changing.effect.declared.values():
+        raw = getattr(changing.effect, f"raw_{p.name}").detach()
+
+        def response(v: torch.Tensor, name: str = f"raw_{p.name}") -> torch.Tensor:
+            return torch.func.functional_call(changing, {f"effect.{name}": v}, (kernel,))
+
+        found = torch.func.jvp(response, (raw,), (torch.ones_like(raw),))
+        assert [x.dtype for x in found] == [torch.float32] * 2
 
 
 def test_gains_of_spots():
