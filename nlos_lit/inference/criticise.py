@@ -358,7 +358,15 @@ class Loop:
         return self.steps("fit", text, kept, lambda: solve_spots(self.grow(fit, self.seed)))
 
     def grown(self, coarse: SurfelFit, name: str) -> SurfelFit:
-        """The scene as fine as the counts ask for, or the parsimonious one, whichever predicts better."""
+        """The scene as fine as the counts ask for, or the parsimonious one, whichever predicts better.
+
+        Args:
+            coarse: the parsimonious one.
+            name: of the step.
+
+        Returns:
+            one of them.
+        """
         return self.better(self.fine(coarse, name), coarse)
 
     def hold(
