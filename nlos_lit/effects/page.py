@@ -56,7 +56,7 @@ def numbers(effect: type[Effect]) -> str:
             if p.size > 1
             else ""
         )
-        null = "scanned" if p.null is None else f"null {p.null:g}" if p.null else ""
+        null = "scanned" if len(p.grid) > 1 else f"null {p.null:g}" if p.null else ""
         said.append(" ".join(filter(None, (f"{name} ({p.unit})", null, size))))
     declared = {p.name for p in effect.declare(nominal_scan())}
     more = ", ".join(name for name in numbers_of(effect) if name not in declared)

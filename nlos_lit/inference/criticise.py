@@ -47,6 +47,7 @@ from nlos_lit.surfels.fit import SurfelFit
 log = logging.getLogger(__name__)
 Rebuild = Callable[[Extension, int], SurfelFit]
 Grow = Callable[[SurfelFit, int], SurfelFit]
+Built = tuple[SurfelFit, SurfelFit | None]  # a parsimonious scene, and the fine one, where it was made
 LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
 HALF = 0.5  # of the misfit: one effect predicts less of what a scene lacks for unknown reasons
@@ -433,7 +434,7 @@ class Loop:
             return gone
 
         while staying:
-            without = dict[str, tuple[SurfelFit, SurfelFit | None]]()
+            without = dict[str, Built]()
             asked, enough = self._asked(staying, scene)
             staying = [member for member, _ in asked]
             gone = leaving(anew=coarse is None)
@@ -450,11 +451,9 @@ class Loop:
                 scene, coarse = before.scene, before.coarse
             else:
                 names = [m.name for m in [*before.members, *staying]]
-                left = ",".join(m.name for m in gone)  # alone it may have been built without
-                coarse, fine = without.get(left) or (self.built_with(coarse, names), None)
-                if fine is None:
-                    fine = self.fine(coarse, f"with_{'_'.join(names)}")
-                scene = self.better(fine, coarse)
+                known = without.get(gone[0].name) if len(gone) == 1 else None
+                coarse, fine = known or (self.built_with(coarse, names), None)
+                scene = self.better(fine or self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
         return Standing(staying, away, scene, coarse), whole
 
     def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
@@ -505,7 +504,7 @@ class Loop:
 
     def _anew(
         self, members: list[Member], coarse: SurfelFit, scene: SurfelFit
-    ) -> tuple[list[Member], dict[str, tuple[SurfelFit, SurfelFit | None]]]:
+    ) -> tuple[list[Member], dict[str, Built]]:
         """Members that hold, asked against parsimonious scenes that were built without them.
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
@@ -525,7 +524,7 @@ class Loop:
         """
         names = [m.name for m in members]
         value, found = log_likelihood(coarse, self.split.select), []
-        built = dict[str, tuple[SurfelFit, SurfelFit | None]]()
+        built = dict[str, Built]()
         self.steps.plan(fit=sum(m.accepted for m in members))
         for member in members:
             if not member.accepted:
@@ -850,7 +849,7 @@ def criticise(
     told(first, first, [])
 
     def asked(effects: bool) -> Pool:
-        found.pools.append(loop.ask(coarse, s.most - len(coarse.extension.effects), effects))
+        found.pools.append(loop.ask(coarse, max(0, s.most - len(coarse.extension.effects)), effects))
         return found.pools[-1]
 
     pool = asked(effects=True)
