@@ -48,8 +48,8 @@ class Effect(nn.Module, Hooks):
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
             it with the same values.
         imitated: a scene fitted without it imitates it: its "light" by more surfels, as of what real captures
-            have strongly, or its "geometry" by places and normals. A diagnosis also builds a scene with all
-            effects of either kind from the first surfel on.
+            have strongly, its "geometry" by places and normals, or its "echoes" by surfels behind the
+            surface. A diagnosis also builds a scene with all effects of each kind from the first surfel on.
         followed_by: free terms that can do what it does: they take any values where it follows an equation.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
@@ -67,7 +67,7 @@ class Effect(nn.Module, Hooks):
     lasting: ClassVar[bool] = False
     followed_by: ClassVar[tuple[str, ...]] = ()
     with_power: ClassVar[tuple[str, ...]] = ()
-    imitated: ClassVar[Literal["light", "geometry"] | None] = None
+    imitated: ClassVar[Literal["light", "geometry", "echoes"] | None] = None
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False
@@ -126,6 +126,14 @@ class Effect(nn.Module, Hooks):
         """The null; shapes at the middle of their grids."""
         for p in self.declared.values():
             self.set(p.name, p.grid[len(p.grid) // 2] if p.null is None else p.null)
+
+    def begin(self, counts: Tensor) -> None:
+        """Take on what a scene is built with from the first surfel on: the null, or what the counts show.
+
+        Args:
+            counts: ``[S, T]`` of the spots that are fitted.
+        """
+        self.reset()
 
     @torch.no_grad()
     def clamp(self) -> None:

@@ -11,6 +11,9 @@ from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import convolve, whole_record
 
+SOONEST = 8  # bins; what comes again earlier cannot be told from how the light of a spot rises and falls
+PART = 1024  # spots whose spectra are held at once
+
 
 class GhostPulse(Effect):
     """Copies of the response follow, from a reflection in the optics, in a cable or in the laser.
@@ -32,6 +35,7 @@ class GhostPulse(Effect):
     """
 
     name = "ghost_pulse"
+    imitated = "echoes"
     followed_by = ("free_time",)
     words = EffectWords(
         phrase="a second, delayed pulse",
@@ -59,6 +63,12 @@ class GhostPulse(Effect):
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"fraction": 0.1}
 
+    def begin(self, counts: Tensor) -> None:
+        """A weak echo, where it shows: at 0 nothing moves its delay, and surfels would take its place."""
+        self.reset()
+        self.set("fraction", self.declared["fraction"].scale)
+        self.set("delay", repeats_after(counts) * self.scan.bin_length)
+
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
         delay = self.value("delay") / self.scan.bin_length
@@ -70,3 +80,25 @@ class GhostPulse(Effect):
         train = torch.zeros_like(later[:1]).expand(len(kernel) + 2)
         train = train.index_add(0, whole, size - later).index_add(0, whole + 1, later)
         return kernel + self.value("fraction") * convolve(kernel, train[: len(kernel)])
+
+
+def repeats_after(counts: Tensor) -> int:
+    """After how many bins the same rises and falls come again, at all spots.
+
+    An echo is a narrow peak of the autocorrelation of what each bin has over the one before, in the mean of
+    spots. What a scene does there is wide. So each lag is compared with those 3 to 5 bins to both sides.
+
+    Args:
+        counts: ``[S, T]``.
+
+    Returns:
+        from ``SOONEST`` to 0.6 T.
+    """
+    lags = torch.zeros(())
+    for part in counts.float().split(PART):
+        steps = part.diff(dim=1)
+        power = torch.fft.rfft(steps, n=2 * counts.shape[1] + SOONEST).abs().square().sum(0)
+        lags = lags.to(power) + torch.fft.irfft(power)
+    asked = torch.arange(SOONEST, max(SOONEST + 1, int(0.6 * counts.shape[1])), device=lags.device)
+    over = lags[asked] - sum(lags[asked + d] for d in (-5, -4, -3, 3, 4, 5)) / 6
+    return int(asked[over.argmax()])

@@ -52,7 +52,9 @@ LENGTHS = (1.0, 0.3, 0.1)  # of the pool's step, that a term may begin with
 WARM = 240  # batches, at falling rates
 HALF = 0.5  # of the misfit: one effect predicts less of what a scene lacks for unknown reasons
 OF_SPOTS = frozenset(cls.name for cls in [*EFFECTS, *FREE] if cls.per_spot)
-IMITATED = [frozenset(cls.name for cls in EFFECTS if cls.imitated == kind) for kind in ("light", "geometry")]
+IMITATED = [
+    frozenset(cls.name for cls in EFFECTS if cls.imitated == kind) for kind in ("light", "geometry", "echoes")
+]
 
 
 @dataclass(frozen=True)
@@ -250,9 +252,10 @@ class Loop:
         """What the search begins with.
 
         Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
-        are also built with all effects of each kind that scenes imitate, at their nulls, from the first
-        surfel on. The best is taken where it surely predicts better than the base, and, when it has become as
-        fine, than the fine scene without any. Where there are no such effects they are a burden.
+        are also built with all effects of each kind that scenes imitate, from the first surfel on, at their
+        nulls or where the counts show them. The best is taken where it surely predicts better than the base,
+        and, when it has become as fine, than the fine scene without any. Where there are no such effects they
+        are a burden.
 
         Args:
             base: without effects, parsimonious.
@@ -269,7 +272,7 @@ class Loop:
                 continue
             extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
             for effect in extension.effects:
-                effect.reset()
+                effect.begin(base.counts)
                 effect.requires_grad_(True)
             self.steps.plan(fit=1)
             text = f"building a scene with {', '.join(e.name for e in extension.effects)}"

@@ -58,6 +58,16 @@ def test_two_effects_are_both_named_and_measured():
 
 
 @pytest.mark.slow
+def test_an_echo_is_found_that_surfels_would_be():
+    """Beside a scene that was built without it nothing asks for it (test_blind_screening.py)."""
+    outcome = run_case(Spec("letters", ("ghost_pulse",), (3,), 1500, 5), QUICK, oracle=False)
+    check(outcome)
+    assert outcome.named == ["ghost_pulse"]
+    for quantity in ("fraction", "delay"):
+        assert abs(outcome.errors["ghost_pulse"][quantity][1]) < 0.02, outcome.found
+
+
+@pytest.mark.slow
 @pytest.mark.xfail(
     reason="said to be unknown from spot to spot instead of along the scan (docs/criticism.md)", strict=False
 )

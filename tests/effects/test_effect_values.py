@@ -16,6 +16,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.ghost_pulse import repeats_after
 from nlos_lit.effects.scan_pieces import lines
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
@@ -381,6 +382,42 @@ def test_delays_of_ghosts_are_scanned_densely():
     assert np.diff(bins)[bins[:-1] < 37] == pytest.approx(3.0)
     assert 0.56 * 512 < bins[-1] <= 0.6 * 512
     assert (bins[1:] / bins[:-1])[bins[:-1] > 42] == pytest.approx(1.06)
+
+
+def two_sheets(fraction: float, delay: int, spots: int = 300) -> torch.Tensor:
+    """[spots, 120] photons of two sheets, 5 - 40 bins apart, and of all that again after ``delay`` bins."""
+    rng = np.random.default_rng(3)
+    bins, near = np.arange(120), rng.uniform(15, 25, (spots, 1))
+    apart = rng.uniform(5, 40, (spots, 1))
+    light = sum(a * np.exp(-(((bins - at) / 1.2) ** 2)) for a, at in ((150, near), (60, near + apart)))
+    light[:, delay:] += fraction * light[:, :-delay]
+    return torch.from_numpy(rng.poisson(light + 0.5)).float()
+
+
+@pytest.mark.parametrize("delay", [8, 11, 30, 71])
+def test_an_echo_shows_where_the_counts_repeat(delay):
+    """Whatever the scene does, which is another thing at each spot; however many spectra are held at once."""
+    assert repeats_after(two_sheets(0.1, delay)) == delay
+    assert repeats_after(two_sheets(0.1, delay, 1500)) == delay
+
+
+def test_no_echo_is_looked_for_where_the_record_ends():
+    """It must come before 0.6 of it, and not before 8 bins; a record too short for that is no error."""
+    for delay in (6, 74):
+        assert 8 <= repeats_after(two_sheets(0.5, delay)) < 72
+    assert repeats_after(two_sheets(0.5, 30)[:, :6]) == 8
+
+
+def test_a_scene_begins_with_a_weak_echo_where_the_counts_repeat():
+    """What is scanned elsewhere stands where it shows; other effects begin at their nulls."""
+    counts = two_sheets(0.1, 30)
+    ghost = effect("ghost_pulse", scan=dataclasses.replace(scene("confocal")[1], n_bins=120))
+    ghost.begin(counts)
+    assert ghost.value("fraction").item() == pytest.approx(0.05)
+    assert ghost.value("delay").item() == pytest.approx(30 * BIN)
+    tail = effect("irf_tail", fraction=0.3)
+    tail.begin(counts)
+    assert tail.value("fraction").item() == 0
 
 
 def test_splines_sum_to_one_and_are_smooth():

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
-from nlos_lit.effects import EFFECTS
+from nlos_lit.effects import EFFECTS, ghost_pulse
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference import criticise as loop
@@ -325,6 +325,18 @@ def test_of_the_kinds_that_scenes_imitate_the_better_one_is_begun_with(monkeypat
     members, scene, coarse = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, []))
     assert scene.names == coarse.names == {taken} == set(names_of(members))
     assert [names for names, _ in world.rebuilt] == [{"irf_tail"}, {"wall_scale"}]
+
+
+def test_a_scene_begins_with_echoes_where_the_counts_of_the_base_repeat(monkeypatch):
+    base, seen = fitted(), []
+    base.counts = torch.ones(3, 5)
+    monkeypatch.setattr(ghost_pulse, "repeats_after", lambda counts: seen.append(counts) or 20)
+    world = World(monkeypatch, {}, [candidate("ghost_pulse", 0.0)], imitated=(("ghost_pulse",),))
+    world.rebuild = lambda extension, seed: FakeFit(extension, seed, anew=True)
+    world.table = {"anew+ghost_pulse": nats(40.0), "fine+anew+ghost_pulse": nats(40.0)}
+    echo = world.loop().begun(base, fitted(fine=True), Pool(world.pool, [])).coarse.extension.effects[0]
+    assert seen[0] is base.counts
+    assert echo.value("delay").item() == pytest.approx(20 * SCAN.bin_length)
 
 
 def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):

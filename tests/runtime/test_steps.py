@@ -137,13 +137,13 @@ class Pipeline:
         self.seeds.append((seed, tuple(e.name for e in extension.effects), False))
         fit = fit_of(self.model, capture, extension, split.fit).copy(extension, seed)
         fit.settings = self.surfels
-        fit.go_on(8)
+        fit.go_on(16)
         return fit
 
     def grow(self, fit, seed) -> SurfelFit:
         self.seeds.append((seed, tuple(e.name for e in fit.extension.effects), True))
         again = fit.copy(copy.deepcopy(fit.extension), seed)
-        again.go_on(8)
+        again.go_on(16)
         return again
 
 
@@ -173,7 +173,7 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
     assert said[0].startswith("rebuilding the scene")
     light = ("retroreflection", "irf_tail", "wall_reflectance", "ambient_map")
     geometry = ("wall_tilt", "wall_scale", "laser_sensor_baseline", "time_offset", "clock_scale")
-    begun = [(0, names, fine) for names in (light, geometry) for fine in (False, True)]
+    begun = [(0, names, fine) for names in (light, geometry, ("ghost_pulse",)) for fine in (False, True)]
     assert first.seeds == [(0, (), False), (0, (), True), *begun]
     assert first.seeds + second.seeds == once.seeds, "nothing is fitted again"
     same = [dataclasses.asdict(dataclasses.replace(d, seconds=0.0, profiles=[])) for d in (whole, again)]
