@@ -117,7 +117,7 @@ class Effect(nn.Module, Hooks):
         value = torch.as_tensor(value, dtype=torch.float32).clamp(p.lower, p.upper)
         getattr(self, f"raw_{name}").copy_((torch.log(value) if p.log else value) / p.scale)
 
-    def set_all(self, values: Mapping[str, float]) -> None:
+    def set_all(self, values: Mapping[str, float | Tensor]) -> None:
         """Store several values by name."""
         for name, value in values.items():
             self.set(name, value)

@@ -252,10 +252,9 @@ class Loop:
         """What the search begins with.
 
         Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
-        are also built with all effects of each kind that scenes imitate, from the first surfel on, at their
-        nulls or where the counts show them. The best is taken where it surely predicts better than the base,
-        and, when it has become as fine, than the fine scene without any. Where there are no such effects they
-        are a burden.
+        are also built with all effects of each kind that scenes imitate, from the first surfel on. The best
+        is taken where it surely predicts better than the base, and, when it has become as fine, than the fine
+        scene without any. Where there are no such effects they are a burden.
 
         Args:
             base: without effects, parsimonious.
@@ -270,10 +269,7 @@ class Loop:
             members = [Member(c) for c in pool.candidates if c.name in imitated]
             if not members:
                 continue
-            extension = copy_effects(Extension([]), [m.candidate.effect for m in members])
-            for effect in extension.effects:
-                effect.begin(base.counts)
-                effect.requires_grad_(True)
+            extension = copy_effects(Extension([]), [self._at_first(m.candidate, base) for m in members])
             self.steps.plan(fit=1)
             text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
             fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
@@ -284,6 +280,14 @@ class Loop:
                 found.append(Held(members, grown, fit))
         best = self.better(*(one.coarse for one in found))
         return next(one for one in found if one.coarse is best)
+
+    def _at_first(self, candidate: Candidate, base: SurfelFit) -> Effect:
+        """What a scene is built with: the effect as it begins, with the shapes that the pool asks for."""
+        effect = copy.deepcopy(candidate.effect)
+        effect.begin(base.counts)
+        if candidate.evidence > self.least:
+            effect.set_all({p.name: candidate.effect.value(p.name) for p in effect.shapes})
+        return effect.requires_grad_(True)
 
     def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
         """A scene built with the effects, or the base, where no surfel survives with them."""

@@ -327,16 +327,21 @@ def test_of_the_kinds_that_scenes_imitate_the_better_one_is_begun_with(monkeypat
     assert [names for names, _ in world.rebuilt] == [{"irf_tail"}, {"wall_scale"}]
 
 
-def test_a_scene_begins_with_echoes_where_the_counts_of_the_base_repeat(monkeypatch):
+def test_a_scene_begins_with_echoes_where_the_counts_repeat_or_the_pool_asks(monkeypatch):
     base, seen = fitted(), []
     base.counts = torch.ones(3, 5)
     monkeypatch.setattr(ghost_pulse, "repeats_after", lambda counts: seen.append(counts) or 20)
     world = World(monkeypatch, {}, [candidate("ghost_pulse", 0.0)], imitated=(("ghost_pulse",),))
     world.rebuild = lambda extension, seed: FakeFit(extension, seed, anew=True)
     world.table = {"anew+ghost_pulse": nats(40.0), "fine+anew+ghost_pulse": nats(40.0)}
-    echo = world.loop().begun(base, fitted(fine=True), Pool(world.pool, [])).coarse.extension.effects[0]
+    for above, delay in ((-0.01, 20), (0.01, 31)):
+        asked = candidate("ghost_pulse", LEAST + above)
+        asked.effect.set("delay", 31 * SCAN.bin_length)
+        begun = world.loop().begun(base, fitted(fine=True), Pool([asked], [])).coarse
+        (echo,) = begun.extension.effects
+        assert echo.value("delay").item() == pytest.approx(delay * SCAN.bin_length)
+        assert echo.value("fraction").item() == pytest.approx(0.05)
     assert seen[0] is base.counts
-    assert echo.value("delay").item() == pytest.approx(20 * SCAN.bin_length)
 
 
 def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):
