@@ -254,7 +254,8 @@ class Loop:
         Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes
         are also built with all effects of each kind that scenes imitate, from the first surfel on. The best
         is taken where it surely predicts better than the base, and, when it has become as fine, than the fine
-        scene without any. Where there are no such effects they are a burden.
+        scene without any. Where there are no such effects they are a burden, or the scene is a luckier one:
+        where it is as good without them, it is the base.
 
         Args:
             base: without effects, parsimonious.
@@ -262,7 +263,7 @@ class Loop:
             pool: what the counts ask for beside the base.
 
         Returns:
-            the effects that are there, and the scenes with them; nobody was asked whether they hold.
+            The effects that are there, if any, and the scenes with them; nobody was asked whether they hold.
         """
         found = [Held([], fine, base)]
         for kind, imitated in enumerate(IMITATED):
@@ -275,7 +276,11 @@ class Loop:
             fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
             if not fit.extension.effects or not self.predicts(fit, base, SURE):
                 continue
-            grown = self.grown(fit, f"begun_with_{'_'.join(m.name for m in members)}")
+            names = [m.name for m in members]
+            bare = self._parted(fit, names, f"begun{kind}_bare")
+            if not self.predicts(fit, bare, SURE):
+                members, fit = [], bare
+            grown = self.grown(fit, f"begun_with_{'_'.join(names)}")
             if self.predicts(grown, fine, SURE):
                 found.append(Held(members, grown, fit))
         best = self.better(*(one.coarse for one in found))
@@ -903,6 +908,11 @@ def criticise(
     if not start.members:
         begun = loop.begun(base, first, pool)
         coarse, new = begun.coarse, begun.members
+        if coarse is not base and not new:
+            start, first = begun, begun.scene
+            found = Findings(first, first, loop.needed(first))
+            told(first, first, [])
+            pool = asked(effects=True)
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)

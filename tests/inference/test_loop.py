@@ -344,6 +344,25 @@ def test_a_scene_begins_with_echoes_where_the_counts_repeat_or_the_pool_asks(mon
     assert seen[0] is base.counts
 
 
+@pytest.mark.parametrize(("more", "effects"), [(2.9, False), (3.0, True)])
+def test_what_a_luckier_scene_gains_is_not_said_of_its_effects(monkeypatch, more, effects):
+    """A scene built with an effect is as good without it but for less than ln 19 nats: that is the base,
+    beside which the counts are asked anew.
+    """
+    pool = [candidate("irf_tail", 0.0), candidate("hum", 50.0)]
+    table = {"fine": nats(20.0), "on": nats(38.0), "anew+irf_tail": nats(38.0 + more), "hum": nats(30.0)}
+    table |= {"fine+anew+irf_tail": nats(99.0), "on+hum": nats(30.0)}
+    world = World(monkeypatch, table, pool, imitated=(("irf_tail",),))
+    held = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, []))
+    assert names_of(held.members) == ["irf_tail"] * effects
+    assert held.coarse.names == held.scene.names == {"irf_tail"} & set(names_of(held.members))
+    found = world.criticise()
+    assert found.base.on is not effects
+    assert found.needed == LEAST
+    assert [len(one.candidates) for one in found.pools][:1] == [2]
+    assert "hum" in names_of(found.accepted)
+
+
 def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):
     """More than half of what it had beside the base; and it takes the place of what predicts less."""
     pool = [candidate("irf_tail", 0.0), candidate("pile_up", 50.0), candidate("hum", 50.0)]

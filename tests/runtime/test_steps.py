@@ -137,13 +137,13 @@ class Pipeline:
         self.seeds.append((seed, tuple(e.name for e in extension.effects), False))
         fit = fit_of(self.model, capture, extension, split.fit).copy(extension, seed)
         fit.settings = self.surfels
-        fit.go_on(16)
+        fit.go_on(80)
         return fit
 
     def grow(self, fit, seed) -> SurfelFit:
         self.seeds.append((seed, tuple(e.name for e in fit.extension.effects), True))
         again = fit.copy(copy.deepcopy(fit.extension), seed)
-        again.go_on(16)
+        again.go_on(80)
         return again
 
 
