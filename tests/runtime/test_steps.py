@@ -125,7 +125,7 @@ def test_a_failed_step_stops_those_that_wait(tmp_path):
 
 
 class Pipeline:
-    """Surfels known beforehand, fitted for a few steps."""
+    """Surfels known beforehand, fitted until their effects are found, as begun scenes are asked without."""
 
     def __init__(self, scene):
         self.model, self.surfels, self.seeds = surfels(scene), SurfelSettings(steps=4, test_spots=64), []
