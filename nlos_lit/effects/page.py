@@ -43,7 +43,7 @@ def numbers(effect: type[Effect]) -> str:
         >>> numbers(EFFECTS.named("irf_tail"))
         '`fraction` f (1); `decay` τ (m) scanned'
         >>> numbers(EFFECTS.named("wall_reflectance"))
-        '`gain_map` (1) 35 coefficients; rms'
+        '`gain_map` (1) 143 coefficients; rms'
     """
     said, told = [], sections(effect)["Parameters"]
     for p in effect.declare(nominal_scan()):

@@ -14,10 +14,10 @@ from nlos_lit.effects.words import EffectWords
 class WallReflectance(SmoothEffect):
     """The wall's reflectance, or the efficiency of laser and sensor optics, varies smoothly over the wall.
 
-    ``signal → signal · e^{f(x, y)}``, f a 6×6 tensor product of cubic splines without its constant;
+    ``signal → signal · e^{f(x, y)}``, f a 12×12 tensor product of cubic splines without its constant;
     ``e^{f(laser) + f(sensor)}`` where both points move, with one f for both.
 
-    Parameters: ``gain_map`` (1, logarithm), at most 35 coefficients, null 0. Quantity ``rms`` (1) of the
+    Parameters: ``gain_map`` (1, logarithm), at most 143 coefficients, null 0. Quantity ``rms`` (1) of the
     logarithm.
 
     Signature: spot totals form a smooth map over the wall; the shape in time is right.
@@ -43,7 +43,7 @@ class WallReflectance(SmoothEffect):
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
-        return over_wall(scan, 6)
+        return over_wall(scan, 12)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

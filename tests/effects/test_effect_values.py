@@ -106,7 +106,7 @@ def grid_scan(n: int) -> Scan:
     return dataclasses.replace(scene("confocal")[1], places=(places,), rank=torch.linspace(-1, 1, n * n))
 
 
-@pytest.mark.parametrize(("name", "pieces"), [("wall_reflectance", 6), ("ambient_map", 5)])
+@pytest.mark.parametrize(("name", "pieces"), [("wall_reflectance", 12), ("ambient_map", 5)])
 def test_maps_hold_every_smooth_function_of_the_wall_but_the_constant(name, pieces):
     built = effect(name, scan=grid_scan(12))
     assert built.functions.shape == (144, pieces**2 - 1)
