@@ -16,7 +16,7 @@ from nlos_lit.effects.words import EffectWords
 class PowerDrift(SmoothEffect):
     """The laser gets stronger or weaker, or the detector's efficiency drifts.
 
-    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 6 functions
+    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 24 functions
     without its constant.
 
     Parameters: ``drift`` (1, logarithm of the gain), 23 coefficients, null 0. Quantities ``rms`` and

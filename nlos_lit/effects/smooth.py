@@ -83,16 +83,17 @@ class SmoothEffect(Effect):
         return {"rms": self.declared[self.coefficients].unit}
 
     def draw(self, values: Mapping[str, float], rng: np.random.Generator) -> None:
-        """A random function of the effect's own basis, of exactly the root mean square given.
+        """A random function, as smooth as its prior has it, of exactly the root mean square given.
 
         Args:
             values: ``rms`` in the coefficients' unit.
-            rng: for the coefficients, normal deviates before they are scaled.
+            rng: for the coefficients, normal deviates as large as their prior before they are scaled.
 
         Raises:
             UserError: it is negative or too large, or the scan has too few spots.
         """
-        field = rng.standard_normal(self.functions.shape[1])
+        deviations = np.array(self.declared[self.coefficients].prior)
+        field = deviations * rng.standard_normal(len(deviations))
         size = float((self.functions.double() @ torch.from_numpy(field)).square().mean().sqrt())
         if size == 0:
             raise UserError(
