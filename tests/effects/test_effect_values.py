@@ -120,6 +120,26 @@ def test_maps_hold_every_smooth_function_of_the_wall_but_the_constant(name, piec
     assert built.quantities()["rms"].value.item() == pytest.approx(0.1 * math.sqrt(pieces**2 - 1), rel=1e-3)
 
 
+def test_a_map_of_the_wall_follows_a_scratch():
+    """A line 0.1 in [-1, 1] wide (standard deviation), some two spots; a tenth of its variance is left."""
+    wall = effect("wall_reflectance", scan=grid_scan(24))
+    x, y = wall.scan.places[0].T
+    for angle in (0.0, 0.6):
+        line = torch.exp(-0.5 * ((math.cos(angle) * x + math.sin(angle) * y - 0.2) / 0.1) ** 2)
+        line = line - line.mean()
+        left = line - wall.functions @ torch.linalg.lstsq(wall.functions, line[:, None]).solution[:, 0]
+        assert left.square().mean() < 0.1 * line.square().mean()
+
+
+def test_drawn_fields_are_smooth():
+    """The eight smoothest of 143 functions hold most of a map that is drawn, and its size is the one given."""
+    wall = effect("wall_reflectance", scan=grid_scan(24))
+    wall.draw({"rms": 0.2}, np.random.default_rng(0))
+    drawn = wall.value("gain_map").detach().square()
+    assert drawn[:8].sum() > 0.8 * drawn.sum()
+    assert wall.quantities()["rms"].value.item() == pytest.approx(0.2, rel=1e-3)
+
+
 def test_ambient_drift_is_a_step_of_the_background_along_the_scan():
     """A lamp that is on for the second half of the scan: e^{±0.2} of the mean level, whatever the wall."""
     scan = grid_scan(16)  # 256 spots in 21 stretches
