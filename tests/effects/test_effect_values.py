@@ -132,7 +132,7 @@ def test_a_map_of_the_wall_follows_a_scratch():
 
 
 def test_drawn_fields_are_smooth():
-    """The eight smoothest of 143 functions hold most of a map that is drawn, and its size is the one given."""
+    """The eight smoothest of 143 functions hold most of a map that is drawn; its size is the one given."""
     wall = effect("wall_reflectance", scan=grid_scan(24))
     wall.draw({"rms": 0.2}, np.random.default_rng(0))
     drawn = wall.value("gain_map").detach().square()
