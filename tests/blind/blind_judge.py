@@ -26,7 +26,7 @@ from nlos_lit.inference.split import split_spots
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings
 
-SURFELS = SurfelSettings(most=2400, batch=48, steps=200)  # conf/surfels/diagnosis.yaml
+SURFELS = SurfelSettings(most=2400)  # conf/surfels/diagnosis.yaml
 
 
 @dataclass(frozen=True)

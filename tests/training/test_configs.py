@@ -279,9 +279,7 @@ def test_a_profile_sets_model_objective_and_optimiser(profile, model, sparsity, 
 def test_the_base_of_a_diagnosis_is_the_surface_of_a_run_but_for_how_it_divides_and_moves():
     """tests/blind and these configs speak of the same base."""
     assert composed()["surfels"] == dataclasses.asdict(SurfelSettings())
-    assert composed(command="diagnose")["surfels"] == dataclasses.asdict(
-        SurfelSettings(most=2400, batch=48, steps=200)
-    )
+    assert composed(command="diagnose")["surfels"] == dataclasses.asdict(SurfelSettings(most=2400))
 
 
 def test_experiments_and_trainers_overrule_what_train_says():
