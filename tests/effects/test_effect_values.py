@@ -108,12 +108,12 @@ def grid_scan(n: int) -> Scan:
 
 @pytest.mark.parametrize(("name", "pieces"), [("wall_reflectance", 12), ("ambient_map", 5)])
 def test_maps_hold_every_smooth_function_of_the_wall_but_the_constant(name, pieces):
-    built = effect(name, scan=grid_scan(12))
-    assert built.functions.shape == (144, pieces**2 - 1)
+    built = effect(name, scan=grid_scan(24))
+    assert built.functions.shape == (576, pieces**2 - 1)
     x, y = built.scan.places[0].T
     smooth = x + 0.5 * y**2 - 0.7 * x * y**3
     smooth = smooth - smooth.mean()
-    fitted = built.functions @ (built.functions.T @ smooth) / 144
+    fitted = built.functions @ (built.functions.T @ smooth) / 576
     assert fitted == pytest.approx(smooth, abs=1e-4)
     built.set(built.coefficients, 0.1)
     # Orthonormal: rms 0.1 · √(number of functions).
