@@ -36,7 +36,9 @@ from nlos_lit.inference.problem import (
 from nlos_lit.surfels.model import SurfelModel, inverse_softplus
 
 pytestmark = FORWARD_MODE
-FINE, ROUGH = 1e-4, 2e-2  # steps; the response's kernel is rounded to single precision
+# Steps of differences. A slope of 8e-6 among counts of 8 is lost in their rounding where steps are finer; the
+# kernel of the response is rounded to single precision.
+FINE, ROUGH = 3e-4, 2e-2
 DELAYS = ("free_scan_delay", "free_wall_delay", "time_drift", "line_delay")
 ACCEPTED = {
     "none": {},
