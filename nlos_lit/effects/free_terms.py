@@ -18,7 +18,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.scan_pieces import bands, stretches
-from nlos_lit.effects.smooth import length, over_wall
+from nlos_lit.effects.smooth import fast, length, over_scan, over_wall
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
@@ -138,7 +138,7 @@ class FreeLines(_FreeCounts):
 
 
 class FreeScan(_FreeCounts):
-    """``m → m e^{f(u)}``, f constant within each of 64 stretches of the scan."""
+    """``m → m e^{f(u)}``, f any combination of 128 splines over the scan, or of one for every four spots."""
 
     name, axis = "free_scan", "scan"
     words = _words(
@@ -147,7 +147,7 @@ class FreeScan(_FreeCounts):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return stretches(scan, 64)
+        return over_scan(scan, fast(scan))[0]
 
 
 class FreeRate(FreeTerm):
@@ -175,7 +175,7 @@ class FreeRate(FreeTerm):
 
 
 class FreeScanBackground(_FreeBackground):
-    """``background → background e^{f(u)}``, f constant within each of 64 stretches of the scan."""
+    """``background → background e^{f(u)}``, f as of ``free_scan``."""
 
     name, axis = "free_scan_background", "scan"
     words = _words(
@@ -184,7 +184,7 @@ class FreeScanBackground(_FreeBackground):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return stretches(scan, 64)
+        return over_scan(scan, fast(scan))[0]
 
 
 class FreeWallBackground(_FreeBackground):
@@ -217,7 +217,7 @@ class _FreeDelay(FreeTerm):
 
 
 class FreeScanDelay(_FreeDelay):
-    """``L → L + f(u)``, f constant within each of 24 stretches of the scan."""
+    """``L → L + f(u)``, f as of ``free_scan``."""
 
     name, axis = "free_scan_delay", "scan"
     words = _words(
@@ -226,7 +226,7 @@ class FreeScanDelay(_FreeDelay):
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return stretches(scan, 24)
+        return over_scan(scan, fast(scan))[0]
 
 
 class FreeWallDelay(_FreeDelay):

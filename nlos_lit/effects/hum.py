@@ -20,13 +20,14 @@ FEWEST, MOST = 2.0, 64.0  # periods in the scan
 class Hum(Effect):
     """The level of foreign light swings along the order of acquisition, many times in a scan.
 
-    ``background → background · (1 + cosine · cos(2πfu) + sine · sin(2πfu))``, u the order of acquisition from
-    0 to 1.
+    ``background → background · max(0, 1 + Σ_k (c_k cos(2πkfu) + s_k sin(2πkfu)))``, k = 1, 2, 3, u the order
+    of acquisition from 0 to 1.
 
-    Parameters: ``cosine``, ``sine`` (1), null 0. ``frequency`` f (1): periods in the scan, scanned from 2 to
-    64 (fewer where spots are too few for it) in steps of half a period, so that a frequency between two
-    values keeps at least 81 % of its power. Quantities ``amplitude`` (1, the root of both squares) and
-    ``frequency``.
+    Parameters: ``cosine`` c_1, ``sine`` s_1 (1), null 0. ``overtones`` c_2, s_2, c_3, s_3 (1), null 0: a lamp
+    at the mains does not swing like a sine. ``frequency`` f (1): periods in the scan, scanned from 2 to 64
+    (fewer where spots are too few for it) in steps of half a period, so that a frequency between two values
+    keeps at least 81 % of its power. Quantities ``amplitude`` (1, the root of both squares of the first wave)
+    and ``frequency``.
 
     Signature: bands in the level before the first return, of a few rows or columns in a raster scan, which
     follow the order of acquisition and leave the scene's light alone.
@@ -75,8 +76,9 @@ class Hum(Effect):
         waves = tuple(
             Parameter(name, "1", 0.0, 0.05, -0.7, 0.7, kind="percent") for name in ("cosine", "sine")
         )
+        overtones = Parameter("overtones", "1", 0.0, 0.05, -0.3, 0.3, size=4, kind="percent")
         frequencies = tuple(FEWEST + k / 2 for k in range(steps + 1))
-        return (*waves, Parameter("frequency", "1", None, 0.1, 1.0, 2 * MOST, grid=frequencies))
+        return (*waves, overtones, Parameter("frequency", "1", None, 0.1, 1.0, 2 * MOST, grid=frequencies))
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -84,8 +86,13 @@ class Hum(Effect):
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         phase = math.pi * self.value("frequency") * (self.rank[spots] + 1)
-        wave = self.value("cosine") * torch.cos(phase) + self.value("sine") * torch.sin(phase)
-        return background * (1 + wave[:, None])
+        waves = torch.stack([f(k * phase) for k in (1, 2, 3) for f in (torch.cos, torch.sin)], -1)
+        first = torch.stack([self.value("cosine"), self.value("sine")])
+        swing = waves @ torch.cat([first, self.value("overtones")])
+        return background * (1 + swing[:, None]).clamp_min(0)
+
+    def settable(self) -> dict[str, str]:
+        return {name: unit for name, unit in super().settable().items() if name != "overtones"}
 
     def quantities(self) -> dict[str, Quantity]:
         waves = torch.stack([self.value("cosine"), self.value("sine")])

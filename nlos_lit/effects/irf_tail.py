@@ -9,7 +9,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import convolve, whole_record
+from nlos_lit.functional.delays import convolve, geometric, whole_record
 
 
 class IrfTail(Effect):
@@ -44,7 +44,7 @@ class IrfTail(Effect):
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         bins = scan.bin_length
-        decays = tuple(bins * d for d in (4.0, 10.0, 25.0, 60.0, 150.0) if d < scan.n_bins / 1.5)
+        decays = geometric(4 * bins, 0.75 * bins * scan.n_bins, 7)
         return (
             Parameter("fraction", "1", 0.0, 0.05, 0.0, 0.9, kind="percent"),
             Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins, grid=decays, log=True),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.parameter import Parameter
-from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.effects.smooth import SLOW, SmoothEffect, over_scan
 from nlos_lit.effects.words import EffectWords
 
 
@@ -49,7 +49,7 @@ class PowerDrift(SmoothEffect):
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
-        return over_time(scan)
+        return over_scan(scan, SLOW)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

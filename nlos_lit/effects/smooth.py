@@ -15,6 +15,9 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis
 
+SLOW, FAST = 24, 128  # splines over the scan, of what changes slowly, and at most of what may change fast
+FEW = 4  # spots for each spline of those
+
 
 class SmoothEffect(Effect):
     """One parameter, the coefficients ``c`` of ``f(s) = Σ_k c_k b_k(s)``; the b_k average to zero with mean
@@ -103,9 +106,29 @@ class SmoothEffect(Effect):
         self.set_given(self.coefficients, drawn, "rms")
 
 
-def over_time(scan: Scan) -> tuple[Tensor, Tensor]:
-    """``[S, ≤ 23]`` smooth functions of the order of acquisition, and their shares ``[≤ 23]``."""
-    return smooth_basis(scan.rank, 24)
+def over_scan(scan: Scan, n: int) -> tuple[Tensor, Tensor]:
+    """Smooth functions of the order of acquisition.
+
+    Args:
+        scan: of the capture.
+        n: splines over it.
+
+    Returns:
+        ``[S, K ≤ n - 1]`` functions, and their shares ``[K]``.
+    """
+    return smooth_basis(scan.rank, n)
+
+
+def fast(scan: Scan) -> int:
+    """How many splines over a scan follow what may change within a few spots.
+
+    Args:
+        scan: of the capture.
+
+    Returns:
+        one for every ``FEW`` spots, from ``SLOW`` to ``FAST``.
+    """
+    return max(SLOW, min(FAST, scan.n_spots // FEW))
 
 
 def over_wall(scan: Scan, n: int) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
-from nlos_lit.effects.smooth import SmoothEffect, over_time
+from nlos_lit.effects.smooth import SmoothEffect, fast, over_scan
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
@@ -18,10 +18,12 @@ from nlos_lit.functional.surfel_paths import Paths
 class TimeDrift(SmoothEffect):
     """The delay between laser and detector drifts, as with temperature.
 
-    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline of 24 functions without its
-    constant, likely a random walk: its coefficients fall with the frequency.
+    ``L → L + f(u)``, u the order of acquisition from -1 to 1, f a cubic spline without its constant, of 128
+    functions (of one for every four spots where they are few), likely a random walk: its coefficients fall
+    with the frequency.
 
-    Parameters: ``drift`` (m of path), 23 coefficients, null 0. Quantities ``rms`` and ``peak_to_peak`` (m).
+    Parameters: ``drift`` (m of path), at most 127 coefficients, null 0. Quantities ``rms`` and
+    ``peak_to_peak`` (m).
 
     Signature: residuals of both signs at every edge in time, their sign changing along the scan.
 
@@ -49,7 +51,7 @@ class TimeDrift(SmoothEffect):
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
-        return over_time(scan)
+        return over_scan(scan, fast(scan))
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

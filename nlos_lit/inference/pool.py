@@ -17,6 +17,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.inference.evidence import (
     SEGMENTS,
     Evidence,
@@ -35,6 +36,8 @@ from nlos_lit.surfels.fit import SurfelFit
 
 MOST = 0.9  # of the largest evidence or gain: a simpler term with so much goes before that with the largest
 KEPT = 16  # shapes of one effect that are tested in full; the others are worth nothing beside them
+CLOSER = 5.0  # nats, from which on a grid that keeps four fifths of what a shape has may cost one
+HALVINGS = 3  # of the grid's step, about the best shape of so much
 TOGETHER = 128  # columns from which on no more are projected along
 WORK = 5e10  # multiplications of the nuisance columns with each other, some 1 s of one core
 Shape = dict[str, float]
@@ -444,8 +447,75 @@ def screen(
     each = (((e, shape), columns) for e in others for shape, columns in _worthwhile(problem, projector, e))
     for (effect, shape), columns, part in _parted(projector, each):
         tried[effect.name].append((shape, _evidence(problem, projector, effect, columns, part, block)))
+    _look_closer(problem, projector, others, tried, block)
     found += [_candidate(e, tried[e.name]) for e in others]
     return sorted(found, key=lambda c: -c.evidence)
+
+
+def _look_closer(
+    problem: Problem,
+    projector: Projector,
+    effects: list[Effect],
+    tried: dict[str, list[tuple[Shape, Evidence]]],
+    block: Tensor,
+) -> None:
+    """Put better ones in the place of the best shapes of the grids, where effects are strong enough to tell.
+
+    What a strong effect leaves at a shape that is off by a part of the grid's step looks like a misfit.
+    """
+
+    def best(effect: Effect) -> int:
+        """Its place among those tried."""
+        return max(range(len(tried[effect.name])), key=lambda k: _worth(tried[effect.name][k]))
+
+    strong = [e for e in effects if e.shapes and not e.needs_paths]
+    strong = [e for e in strong if tried[e.name][best(e)][1].loud - math.log(len(e.shape_grid())) > CLOSER]
+    first = {e.name: best(e) for e in strong}
+    for halving in range(1, HALVINGS + 1):
+        for k in range(max((len(e.shapes) for e in strong), default=0)):
+            asked = list[tuple[Effect, Shape]]()
+            for effect in (e for e in strong if k < len(e.shapes)):
+                p, (shape, _) = effect.shapes[k], tried[effect.name][first[effect.name]]
+                asked += [(effect, {**shape, p.name: v}) for v in beside_it(p, shape[p.name], halving)]
+            for (effect, shape), columns, part in _parted(projector, _at(problem, asked)):
+                now = shape, _evidence(problem, projector, effect, columns, part, block)
+                place = first[effect.name]
+                tried[effect.name][place] = max(tried[effect.name][place], now, key=_worth)
+
+
+def _at(problem: Problem, asked: list[tuple[Effect, Shape]]) -> Iterator[tuple[tuple[Effect, Shape], Tensor]]:
+    """Effects and shapes with their columns."""
+    for effect, shape in asked:
+        effect.set_all(shape)
+        yield (effect, shape), weighted_columns(problem, effect)
+
+
+def beside_it(shape: Parameter, value: float, halving: int) -> list[float]:
+    """Values on both sides of one, within the grid.
+
+    Args:
+        shape: that is scanned.
+        value: between the ends of its grid.
+        halving: how often the grid's step is halved to come to theirs.
+
+    Returns:
+        two values, or one where ``value`` is an end, or none where the grid has no steps.
+
+    Examples:
+        >>> decay = Parameter("decay", "m", None, 0.2, 0.01, 2.0, grid=(0.1, 0.4, 1.6), log=True)
+        >>> [round(v, 3) for v in beside_it(decay, 0.4, 1)], [round(v, 3) for v in beside_it(decay, 0.1, 1)]
+        ([0.2, 0.8], [0.2])
+    """
+    grid = np.sort(np.log(shape.grid) if shape.log else shape.grid)
+    steps = np.arange(len(grid))
+    place = np.interp(math.log(value) if shape.log else value, grid, steps)
+    near = np.array([place - 0.5**halving, place + 0.5**halving])
+    found = np.interp(near[(near >= 0) & (near <= steps[-1])], steps, grid)
+    return (np.exp(found) if shape.log else found).tolist()
+
+
+def _worth(tried: tuple[Shape, Evidence]) -> tuple[float, float]:
+    return tried[1].nats, tried[1].loud
 
 
 def _evidence(
@@ -457,7 +527,7 @@ def _evidence(
 
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:
     """The best shape; the evidence is the mean of the Bayes factors of all that could have been."""
-    shape, best = max(tried, key=lambda entry: (entry[1].nats, entry[1].loud))
+    shape, best = max(tried, key=_worth)
     mean = mean_factor([e.nats for _, e in tried], len(effect.shape_grid()))
     effect.set_all(shape)
     told = (mean, best.retained, best.scatter, shape, best.step, best.error, max(mean, best.loud), best.lit)

@@ -56,14 +56,14 @@ def test_a_jump_is_told_by_its_place_and_height():
     (found,) = followed(np.where(passed < 0.6, 1.0, 1.3)).values()
     assert found.name == "counts_over_scan_step"
     assert found.offered
-    assert found.share > 1, "two numbers are known better than 64"
+    assert found.share > 1, "two numbers are known better than 63"
     (step,) = found.fit.extension.effects
     assert float(step.value("place").detach()) == pytest.approx(0.6, abs=0.02)
     assert float(step.value("height").detach()) == pytest.approx(np.log(1.3), rel=0.1)
-    free = effect_of("free_scan", step.scan, field=torch.linspace(0, 1, 64))
+    free = effect_of("free_scan", step.scan, field=torch.eye(63)[0])
     line = laid_through(step, free, found.fit, torch.tensor([0.0, SIDE**2]))
     assert line[1] - line[0] == pytest.approx(np.log(1.3), rel=0.1)
-    assert line.mean() == pytest.approx(0.5, abs=0.1), "as high as the term"
+    assert line.mean() == pytest.approx(0.0, abs=0.1), "as high as the term, which is zero on average"
 
 
 def test_what_follows_no_formula_is_not_offered():
