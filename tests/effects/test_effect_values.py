@@ -244,6 +244,13 @@ def test_hum_swings_in_the_order_of_acquisition():
     seen = hum.background(torch.ones(5, LAST), torch.arange(5)).detach()
     assert seen[:, 9].tolist() == pytest.approx([1.3, 0.7, 1.3, 0.6, 1.4], rel=1e-5)
     assert hum.quantities()["amplitude"].value.item() == pytest.approx(0.5, abs=1e-4)
+    # Overtones: cosines and sines of twice and thrice the phase, which is 0, π, 0, 3π/2, π/2 here.
+    hum.set("overtones", torch.tensor([0.1, 0.0, 0.0, 0.2]))
+    seen = hum.background(torch.ones(5, LAST), torch.arange(5)).detach()
+    assert seen[:, 9].tolist() == pytest.approx([1.4, 0.8, 1.4, 0.7, 1.1], rel=1e-5)
+    hum.set_all({"cosine": -0.7, "sine": 0.0, "overtones": -0.3})  # no less than nothing
+    assert hum.background(torch.ones(5, LAST), torch.arange(5)).min() == 0
+    assert set(hum.settable()) == {"cosine", "sine", "frequency"}
 
 
 def test_a_frequency_of_the_hum_keeps_most_of_its_power_on_the_grid():

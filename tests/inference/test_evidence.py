@@ -453,13 +453,14 @@ def test_every_shape_that_could_have_been_counts(monkeypatch):
     assert look("tcspc_nonlinearity", truth).evidence == pytest.approx(alone.evidence + math.log(2), abs=1e-3)
 
 
+def ripple(period: float, rows: int = ROWS) -> Tensor:
+    """That begins anew after so many rows."""
+    phase = 2 * math.pi * (torch.arange(ROWS) % rows) / period
+    return torch.stack([phase.sin(), phase.cos()], 1)
+
+
 def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
-
-    def ripple(period: float) -> Tensor:
-        phase = 2 * math.pi * torch.arange(ROWS) / period
-        return torch.stack([phase.sin(), phase.cos()], 1)
-
     monkeypatch.setattr(
         pool, "weighted_columns", lambda problem, effect, *_: ripple(float(effect.value("period").detach()))
     )
@@ -472,6 +473,26 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     # Unevenness, the residual, then all columns at once, and those on both sides of the best, thrice.
     assert passes == [0, 1, 2 * pool.KEPT, 4, 4, 4]
     assert found.shape["period"] == period
+
+
+def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enough_to_tell(monkeypatch):
+    """A ripple of a period that the grid does not have: the nearest of the grid leaves much of it."""
+    monkeypatch.setattr(
+        pool, "weighted_columns", lambda problem, effect, *_: ripple(float(effect.value("period").detach()), 44)
+    )
+    grid = [shape["period"] for shape in effect_of("tcspc_nonlinearity", SCAN).shape_grid()]
+    period = 0.7 * grid[4] + 0.3 * grid[5]
+    truth, noise = ripple(period, 44) @ torch.tensor([1.0, -0.6]), normal(ROWS, seed=7)
+    found = look("tcspc_nonlinearity", truth + noise)
+    assert found.shape["period"] == pytest.approx(period, abs=0.2 * abs(grid[4] - grid[5]))
+    for strength in (0.5, 0.1, 0.03):
+        loud = look("tcspc_nonlinearity", strength * truth + noise)
+        on_grid = min(abs(loud.shape["period"] - p) for p in grid) < 1e-6
+        assert on_grid == (loud.loud - math.log(len(grid)) < pool.CLOSER)
+    monkeypatch.setattr(pool, "HALVINGS", 0)
+    coarse = look("tcspc_nonlinearity", truth + noise)
+    assert coarse.shape["period"] == grid[4]
+    assert found.evidence > 1.02 * coarse.evidence
 
 
 def test_terms_are_projected_together(monkeypatch, known):
