@@ -179,6 +179,11 @@ class Effect(nn.Module, Hooks):
                 total = total.to(raw.device) + 0.5 * (self._precision(p).to(raw.device) * off.square()).sum()
         return total
 
+    def reach(self) -> dict[nn.Parameter, Tensor]:
+        """By stored parameter with a prior, how far that expects each value from its null: 1 at most."""
+        known = {getattr(self, f"raw_{p.name}"): p for p in self.declared.values() if p.prior}
+        return {raw: self._precision(p).clamp_min(1.0).rsqrt().to(raw.device) for raw, p in known.items()}
+
     def _precision(self, p: Parameter) -> Tensor:
         """[size] of stored values of a parameter that has a prior."""
         return (torch.tensor(p.prior) * (self.prior_scale / p.scale)).square().reciprocal()

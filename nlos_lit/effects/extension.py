@@ -73,3 +73,7 @@ class Extension(nn.Module, Hooks):
     def penalty(self) -> Tensor | float:
         """Nats that the priors of all effects take."""
         return sum(effect.penalty() for effect in self.effects)
+
+    def reach(self) -> dict[nn.Parameter, Tensor]:
+        """Of all effects."""
+        return {raw: reach for effect in self.effects for raw, reach in effect.reach().items()}

@@ -513,7 +513,7 @@ class SurfelFit:
             *([] if self.plan[0].contest else settled),
         ]
         kept = [group | {"highest": group["lr"]} for group in groups if group["params"]]
-        optimizer = torch.optim.Adam(kept, betas=(0.9, 0.98))
+        optimizer = _Reined(kept, self.extension.reach())
         self._set_rates(optimizer)
         return optimizer
 
@@ -688,6 +688,31 @@ def _beside(
     observed = capture.gated_observed()
     seen = None if observed is None else torch.from_numpy(observed[rows])
     return counts, model.expected(spots, hooks).cpu(), seen
+
+
+class _Reined(torch.optim.Adam):
+    """Adam, but numbers that a prior expects to be small take steps as small.
+
+    Adam moves each number about as far, however little the counts say of it. Where there are a hundred of one
+    effect, its field would shake by ten times as much, and go astray where no spots are fitted.
+
+    Args:
+        groups: of parameters.
+        reach: share of a step, of each number of some of them.
+    """
+
+    def __init__(self, groups: list[dict[str, Any]], reach: dict[torch.nn.Parameter, Tensor]) -> None:
+        super().__init__(groups, betas=(0.9, 0.98))
+        held = {parameter for group in groups for parameter in group["params"]}
+        self.reach = {parameter: share for parameter, share in reach.items() if parameter in held}
+
+    def step(self, closure: Any = None) -> Any:
+        before = [parameter.detach().clone() for parameter in self.reach]
+        loss = super().step(closure)
+        with torch.no_grad():
+            for (parameter, share), old in zip(self.reach.items(), before, strict=True):
+                parameter.copy_(torch.lerp(old, parameter, share))
+        return loss
 
 
 def _parameters(optimizer: torch.optim.Optimizer) -> list[Tensor]:

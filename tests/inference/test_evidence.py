@@ -478,7 +478,9 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
 def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enough_to_tell(monkeypatch):
     """A ripple of a period that the grid does not have: the nearest of the grid leaves much of it."""
     monkeypatch.setattr(
-        pool, "weighted_columns", lambda problem, effect, *_: ripple(float(effect.value("period").detach()), 44)
+        pool,
+        "weighted_columns",
+        lambda problem, effect, *_: ripple(float(effect.value("period").detach()), 44),
     )
     grid = [shape["period"] for shape in effect_of("tcspc_nonlinearity", SCAN).shape_grid()]
     period = 0.7 * grid[4] + 0.3 * grid[5]
