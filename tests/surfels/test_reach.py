@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pytest
-import torch
 from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, surfels
 
 from nlos_lit.capture.scan import Scan
