@@ -1,8 +1,9 @@
 """Free terms: what is wrong along an axis, whatever causes it (after Kennedy and O'Hagan, 2001).
 
 A free term is an effect without a name: its coefficients may take any values along one axis or a pair of
-axes, each with the same prior deviation. It stands in the same contest as the effects of the registry, can be
-fitted, shown and measured like them, and says where to look when no equation fits.
+axes, each with the same prior deviation, or, along the scan, with the same for each octave of frequencies. It
+stands in the same contest as the effects of the registry, can be fitted, shown and measured like them, and
+says where to look when no equation fits.
 
     f = Σ_k c_k b_k,    counts → counts · e^f   or   background → background · e^f   or   L → L + f
 """
@@ -70,9 +71,14 @@ class FreeTerm(Free):
         return cls.basis(scan).shape[1]
 
     @classmethod
+    def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
+        """Prior deviations of the coefficients, in their unit."""
+        return (largest,) * cls.size(scan)
+
+    @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        k = cls.size(scan)
-        return (Parameter("field", "1", 0.0, 0.05, -3.0, 3.0, size=k, prior=(0.5,) * k, kind="percent"),)
+        prior = cls.likely(scan, 0.5)
+        return (Parameter("field", "1", 0.0, 0.05, -3.0, 3.0, size=len(prior), prior=prior, kind="percent"),)
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -88,6 +94,23 @@ class FreeTerm(Free):
     def quantities(self) -> dict[str, Quantity]:
         p, field = self.declared["field"], self.values()
         return {"rms": Quantity(length(field / field.numel() ** 0.5, p.scale), p.unit, kind=p.kind)}
+
+
+class _AlongScan(FreeTerm):
+    """128 splines over the scan, or one for every four spots; each octave of frequencies is as likely."""
+
+    axis = "scan"
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_scan(scan, fast(scan))[0]
+
+    @classmethod
+    def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
+        share = over_scan(scan, fast(scan))[
+            1
+        ]  # inverse squares of frequencies; so many more are in an octave
+        return tuple((largest * share**0.25).tolist())
 
 
 class _FreeCounts(FreeTerm):
@@ -137,17 +160,13 @@ class FreeLines(_FreeCounts):
         return torch.cat([bands((place[:, k] + 1) / 2, 24) for k in (0, 1)], 1)
 
 
-class FreeScan(_FreeCounts):
+class FreeScan(_AlongScan, _FreeCounts):
     """``m → m e^{f(u)}``, f any combination of 128 splines over the scan, or of one for every four spots."""
 
-    name, axis = "free_scan", "scan"
+    name = "free_scan"
     words = _words(
         "over the course of the scan", "Spots of one stretch of time count too much or too little."
     )
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_scan(scan, fast(scan))[0]
 
 
 class FreeRate(FreeTerm):
@@ -174,17 +193,13 @@ class FreeRate(FreeTerm):
         return expected * torch.exp(self.tents(expected) @ self.value("field").reshape(-1))[:, None]
 
 
-class FreeScanBackground(_FreeBackground):
+class FreeScanBackground(_AlongScan, _FreeBackground):
     """``background → background e^{f(u)}``, f as of ``free_scan``."""
 
-    name, axis = "free_scan_background", "scan"
+    name = "free_scan_background"
     words = _words(
         "in the background over the course of the scan", "Light that is not the scene's comes and goes."
     )
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_scan(scan, fast(scan))[0]
 
 
 class FreeWallBackground(_FreeBackground):
@@ -203,8 +218,9 @@ class FreeWallBackground(_FreeBackground):
 class _FreeDelay(FreeTerm):
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        k, step = cls.size(scan), scan.bin_length
-        return (Parameter("field", "m", 0.0, step, -20 * step, 20 * step, size=k, prior=(step,) * k),)
+        step = scan.bin_length
+        prior = cls.likely(scan, step)
+        return (Parameter("field", "m", 0.0, step, -20 * step, 20 * step, size=len(prior), prior=prior),)
 
     def factors(self, spots: Tensor) -> Tensor:
         return self.functions[spots]
@@ -216,17 +232,13 @@ class _FreeDelay(FreeTerm):
         return length + self.at(spots)[:, None]
 
 
-class FreeScanDelay(_FreeDelay):
+class FreeScanDelay(_AlongScan, _FreeDelay):
     """``L → L + f(u)``, f as of ``free_scan``."""
 
-    name, axis = "free_scan_delay", "scan"
+    name = "free_scan_delay"
     words = _words(
         "in the delay over the course of the scan", "Light comes early or late in one stretch of time."
     )
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_scan(scan, fast(scan))[0]
 
 
 class FreeWallDelay(_FreeDelay):
