@@ -72,7 +72,15 @@ class FreeTerm(Free):
 
     @classmethod
     def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
-        """Prior deviations of the coefficients, in their unit."""
+        """Prior deviations of the coefficients.
+
+        Args:
+            scan: of the capture.
+            largest: of them, in their unit.
+
+        Returns:
+            one for each.
+        """
         return (largest,) * cls.size(scan)
 
     @classmethod

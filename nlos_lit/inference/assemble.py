@@ -17,6 +17,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
+from nlos_lit.effects.smooth import fast
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
 from nlos_lit.inference.criticise import CriticismSettings
@@ -307,7 +308,7 @@ def shape_of(effect: Free, scan: Scan) -> Shape:
         edges = scan.mean_counts * np.exp(np.linspace(*RATES, len(values) + 1))
         return Shape("rate", p.unit, edges, values.numpy())
     if effect.axis == "scan":
-        edges, mean = _along_scan(values[:, None], scan)
+        edges, mean = _along_scan(values[:, None], scan, fast(scan))
         return Shape("scan", p.unit, edges, mean[:, 0])
     if effect.axis == "time×scan":
         edges, mean = _along_scan(values[:, first:last], scan)

@@ -234,7 +234,8 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
     scan = Scan.of(capture)
     (tail,) = build_effects(["irf_tail"], scan)
     tail.set("fraction", 0.25)
-    tail.set("decay", 25 * BIN)
+    decay = tail.declared["decay"].grid[3]  # 24 bins
+    tail.set("decay", decay)
     expected = model.expected(spots, Extension([tail]))
     leaks = []
     for seed in range(8):
@@ -242,7 +243,7 @@ def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
         found = Extension(build_effects(["irf_tail", "direct_leak", "wall_reflectance"], scan))
         choose_shapes(model, found, spots, counts)
         fitted_tail, wall, leak = found.effects
-        assert fitted_tail.value("decay").item() == pytest.approx(25 * BIN)
+        assert fitted_tail.value("decay").item() == pytest.approx(decay)
         assert fitted_tail.value("fraction").item() == pytest.approx(0.25, abs=0.02)
         assert wall.value("gain_map").abs().max() == 0
         leaks.append(leak.value("amplitude").item())
