@@ -19,7 +19,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.scan_pieces import bands, stretches
-from nlos_lit.effects.smooth import fast, length, over_scan, over_wall
+from nlos_lit.effects.smooth import falling_prior, fast, length, over_scan, over_wall
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Paths
@@ -115,10 +115,8 @@ class _AlongScan(FreeTerm):
 
     @classmethod
     def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
-        share = over_scan(scan, fast(scan))[
-            1
-        ]  # inverse squares of frequencies; so many more are in an octave
-        return tuple((largest * share**0.25).tolist())
+        # An octave has as many more functions as it has higher frequencies: variances fall as much.
+        return falling_prior(over_scan(scan, fast(scan))[1], largest, 0.5)
 
 
 class _FreeCounts(FreeTerm):

@@ -63,7 +63,7 @@ class SmoothEffect(Effect):
             The one parameter.
         """
         share = cls.basis(scan)[1]
-        prior = tuple((likely * share ** (cls.falling / 2)).tolist())
+        prior = falling_prior(share, likely, cls.falling)
         return (
             Parameter(
                 cls.coefficients, unit, 0.0, scale, -bound, bound, size=len(share), prior=prior, kind=kind
@@ -104,6 +104,24 @@ class SmoothEffect(Effect):
             )
         drawn = torch.from_numpy(field * (self.given_size(values, "rms") / size))
         self.set_given(self.coefficients, drawn, "rms")
+
+
+def falling_prior(share: Tensor, first: float, falling: float) -> tuple[float, ...]:
+    """Prior deviations of coefficients that fall with a power of the frequency.
+
+    Args:
+        share: ``[K]`` inverse squares of the functions' frequencies.
+        first: deviation where that is 1.
+        falling: the power.
+
+    Returns:
+        K deviations.
+
+    Examples:
+        >>> falling_prior(torch.tensor([1.0, 0.25]), 3.0, 1.0)
+        (3.0, 1.5)
+    """
+    return tuple((first * share ** (falling / 2)).tolist())
 
 
 def over_scan(scan: Scan, n: int) -> tuple[Tensor, Tensor]:

@@ -464,23 +464,22 @@ def _look_closer(
     What a strong effect leaves at a shape that is off by a part of the grid's step looks like a misfit.
     """
 
-    def best(effect: Effect) -> int:
-        """Its place among those tried."""
-        return max(range(len(tried[effect.name])), key=lambda k: _worth(tried[effect.name][k]))
-
-    strong = [e for e in effects if e.shapes and not e.needs_paths]
-    strong = [e for e in strong if tried[e.name][best(e)][1].loud - math.log(len(e.shape_grid())) > CLOSER]
-    first = {e.name: best(e) for e in strong}
+    best = dict[str, int]()  # of those tried
+    for effect in effects:
+        place = max(range(len(tried[effect.name])), key=lambda k: _worth(tried[effect.name][k]))
+        strong = tried[effect.name][place][1].loud - math.log(len(effect.shape_grid())) > CLOSER
+        if strong and not effect.needs_paths:
+            best[effect.name] = place
     for halving in range(1, HALVINGS + 1):
-        for k in range(max((len(e.shapes) for e in strong), default=0)):
+        for k in range(max(len(e.shapes) for e in effects) if best else 0):
             asked = list[tuple[Effect, Shape]]()
-            for effect in (e for e in strong if k < len(e.shapes)):
-                p, (shape, _) = effect.shapes[k], tried[effect.name][first[effect.name]]
+            for effect in (e for e in effects if e.name in best and k < len(e.shapes)):
+                p, (shape, _) = effect.shapes[k], tried[effect.name][best[effect.name]]
                 asked += [(effect, {**shape, p.name: v}) for v in beside_it(p, shape[p.name], halving)]
             for (effect, shape), columns, part in _parted(projector, _at(problem, asked)):
                 now = shape, _evidence(problem, projector, effect, columns, part, block)
-                place = first[effect.name]
-                tried[effect.name][place] = max(tried[effect.name][place], now, key=_worth)
+                old = tried[effect.name][best[effect.name]]
+                tried[effect.name][best[effect.name]] = max(old, now, key=_worth)
 
 
 def _at(problem: Problem, asked: list[tuple[Effect, Shape]]) -> Iterator[tuple[tuple[Effect, Shape], Tensor]]:

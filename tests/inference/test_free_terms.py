@@ -52,9 +52,7 @@ def test_the_null_changes_nothing_and_the_rest_does(term):
         assert effect.quantities()["rms"].value > 0
         precision = effect.precision()
         assert torch.all(precision > 0)
-        if (
-            term.axis == "scan"
-        ):  # as many half waves as the function's number: an octave has the same variance
+        if term.axis == "scan":  # k half waves: an octave of them has the same variance
             assert (precision / precision[0])[:30].tolist() == pytest.approx(range(1, 31), rel=1e-3)
         else:
             assert len(set(precision.tolist())) == 1, "every coefficient has the same prior deviation"
