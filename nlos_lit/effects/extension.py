@@ -40,9 +40,11 @@ class Extension(nn.Module, Hooks):
             length = effect.time(length, paths, spots)
         return length
 
-    def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+    def transients(
+        self, transients: Tensor, energy: Tensor, albedo: Tensor, paths: Paths, spots: Tensor
+    ) -> Tensor:
         for effect in self.effects:
-            transients = effect.transients(transients, energy, paths, spots)
+            transients = effect.transients(transients, energy, albedo, paths, spots)
         return transients
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:

@@ -17,12 +17,13 @@ from nlos_lit.functional.surfel_paths import Paths, SplineSplat
 
 CLUSTERS = 48
 SAMPLES = 512  # surfels between which throughput is worked out
+CLOSEST = 1e-3  # m between them: rounding leaves a fifth of that of two in the same place
 
 
 class HigherOrderBounces(Effect):
     """The fourth bounce laser → wall → surfel a → surfel b → wall → sensor is added to the third.
 
-    ``H_r → H_r + strength Σ_ab ρ_a ρ_b/π · F_l(a) A_a · cosθ_ab cosθ_ba/(d_ab² + A/π) · A_b F_s(b)`` at
+    ``H_r → H_r + strength Σ_ab ρ_a ρ_b/(π ρ̄) · F_l(a) A_a · cosθ_ab cosθ_ba/(d_ab² + A/π) · A_b F_s(b)`` at
     ``d_la + d_ab + d_bs``, with ``F = cosθ_wall cosθ_surfel/d²`` of the leg from the wall.
 
     The common reflectances and 1/π of the wall are left out, as in the third bounce. A, the mean area of the
@@ -30,12 +31,13 @@ class HigherOrderBounces(Effect):
 
     Estimator: surfels join in at most 48 clusters, cells of a cube lattice. Powers into and out of the
     clusters are exact sums over their surfels: what leaves surfel a towards b is the third bounce's energy
-    over its other leg, ``ρ A F_l = energy/F_s``. The throughput between clusters is its mean over pairs of
-    their surfels (of at most about 512 of them), the length likewise. Arrivals are blurred over a cell.
+    over its other leg, ``ρ A F_l = energy/F_s``, and at most that of a surfel in full view: at its centre F_s
+    may vanish where it does not at each of its points. The throughput between clusters is its mean over pairs
+    of their surfels (of at most about 512 of them), the length likewise. Arrivals are blurred over a cell.
 
-    Parameters: ``strength`` (1), null 0; 1 is physical if albedo 1 means albedo 1. Here albedo is relative,
-    so that strength carries the unknown scale. Quantity ``share`` (1): fourth bounce over third, known after
-    a rendering without gradients (its last batch).
+    Parameters: ``strength`` (1), null 0: mean albedo of the surfaces. Surfels know theirs but for a common
+    factor, so that they are divided by their mean over the area, ρ̄. Quantity ``share`` (1): fourth bounce
+    over third, known after a rendering without gradients (its last batch).
 
     Signature: a broad excess behind concave surfaces, from twice the shortest leg plus a gap on; none for one
     flat or convex surface.
@@ -48,6 +50,7 @@ class HigherOrderBounces(Effect):
     """
 
     name = "higher_order_bounces"
+    imitated = "echoes"
     followed_by = ("free_response_wall",)
     words = EffectWords(
         phrase="light that bounced twice inside the hidden scene",
@@ -72,7 +75,7 @@ class HigherOrderBounces(Effect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("strength", "1", 0.0, 0.5, 0.0, 50.0),)
+        return (Parameter("strength", "1", 0.0, 0.1, 0.0, 5.0),)
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -88,17 +91,23 @@ class HigherOrderBounces(Effect):
     def numbers(self) -> dict[str, Number]:
         return {**super().numbers(), "share": Number("1", "percent")}
 
-    def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
-        fourth = self.fourth_bounce(energy, paths, spots, transients.shape[1])
+    def transients(
+        self, transients: Tensor, energy: Tensor, albedo: Tensor, paths: Paths, spots: Tensor
+    ) -> Tensor:
+        mean = (albedo @ paths.area) / paths.area.sum()
+        fourth = self.fourth_bounce(energy, albedo, paths, spots, transients.shape[1]) / mean
         if not torch.is_grad_enabled():
             self.ratio = float(fourth.sum()) / max(float(energy.sum()), 1e-30)
         return transients + self.value("strength") * fourth
 
-    def fourth_bounce(self, energy: Tensor, paths: Paths, spots: Tensor, n_bins: int) -> Tensor:
-        """Light on arrival at strength 1.
+    def fourth_bounce(
+        self, energy: Tensor, albedo: Tensor, paths: Paths, spots: Tensor, n_bins: int
+    ) -> Tensor:
+        """Light on arrival, if albedos were no relative ones.
 
         Args:
             energy: ``[B, M, Q]`` of the third bounce.
+            albedo: ``[M]`` of the surfels.
             paths: their geometry.
             spots: ``[B]`` indices into the scan.
             n_bins: of the record.
@@ -112,7 +121,8 @@ class HigherOrderBounces(Effect):
         sensor, sensor_leg = (
             (laser, laser_leg) if self.scan.confocal else throughput(self.sensor[spots], paths)
         )
-        into, out = power / sensor, power / laser
+        most = albedo * paths.area
+        into, out = torch.minimum(power / sensor, most * laser), torch.minimum(power / laser, most * sensor)
         inward, outward = into @ member, out @ member
         first = (into * laser_leg) @ member / (inward + 1e-12)
         last = (out * sensor_leg) @ member / (outward + 1e-12)
@@ -128,10 +138,11 @@ class HigherOrderBounces(Effect):
 
 def clusters(centre: Tensor) -> tuple[Tensor, float]:
     """Who belongs together: ``[M, C]`` ones and zeros, C ≤ 48, and the side of the cubes, m."""
-    low = centre.amin(0)
-    cell = max(float((centre.amax(0) - low).max()) / CLUSTERS, 1e-6)
+    away = centre - centre.amin(0)
+    cell = max(float(away.max()) / CLUSTERS, 1e-6)
+    sides = torch.tensor([1, 2 * CLUSTERS, 4 * CLUSTERS**2], device=centre.device)
     while True:
-        cubes, index = torch.unique(torch.floor((centre - low) / cell).long(), dim=0, return_inverse=True)
+        cubes, index = torch.unique(torch.floor(away / cell).long() @ sides, return_inverse=True)
         if len(cubes) <= CLUSTERS:
             return torch.nn.functional.one_hot(index, len(cubes)).to(centre.dtype), cell
         cell *= 1.15
@@ -168,12 +179,10 @@ def between(paths: Paths, member: Tensor) -> tuple[Tensor, Tensor]:
     centre, normal, area = paths.centre[chosen], paths.normal[chosen], paths.area[chosen]
     share = member[chosen] * area[:, None]
     share = share / share.sum(0)
-    away = centre[None] - centre[:, None]
-    leaving = (away * normal[:, None]).sum(2).clamp_min(0)
-    square = away.square().sum(2)
-    # Ones keep the distance of a surfel from itself, and from one in the same place, differentiable; both
-    # cosines are 0.
-    square = square + (square == 0)
+    centre = centre - centre.mean(0)
+    own = centre.square().sum(1)
+    leaving = (normal @ centre.T - (normal * centre).sum(1)[:, None]).clamp_min(0)
+    square = (own[:, None] + own - 2 * centre @ centre.T).clamp_min(CLOSEST**2)
     exchange = leaving * leaving.T / (square * (square + (area[:, None] + area) / (2 * math.pi)))
     total = share.T @ exchange @ share
     distance = share.T @ (exchange * torch.sqrt(square)) @ share

@@ -62,12 +62,15 @@ class Hooks:
         """
         return length
 
-    def transients(self, transients: Tensor, energy: Tensor, paths: Paths, spots: Tensor) -> Tensor:
+    def transients(
+        self, transients: Tensor, energy: Tensor, albedo: Tensor, paths: Paths, spots: Tensor
+    ) -> Tensor:
         """Light on arrival, before the response.
 
         Args:
             transients: ``[B, T]`` so far.
             energy: ``[B, M, Q]`` of the paths.
+            albedo: ``[M]`` of the surfels, known but for a common factor.
             paths: their geometry.
             spots: ``[B]`` indices into the scan.
 

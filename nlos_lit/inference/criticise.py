@@ -793,7 +793,7 @@ class Loop:
         trials = weighed(trials, self.block)
         best = chosen(trials, s.odds, self.least)
         assert best.candidate is not None
-        group = group_of(best, trials, self.block, s.open_share)
+        group = group_of(best, trials, self.block, s.open_share, self.least)
         return replace(member, candidate=best.candidate, trials=trials, group=group)
 
     def _misfit(self, fit: SurfelFit) -> float:

@@ -244,19 +244,34 @@ def cost(trial: Trial) -> tuple[bool, int, float]:
     return trial.name in FREE_NAMES, len(trial.candidate.step), -trial.gain.nats
 
 
-def group_of(best: Trial, trials: list[Trial], block: np.ndarray, least: float) -> dict[str, float]:
+def group_of(
+    best: Trial, trials: list[Trial], block: np.ndarray, share: float, least: float
+) -> dict[str, float]:
     """What the capture cannot tell from the best, among those of its kind: effects, or free terms.
+
+    Select spots weigh them. Fitted spots have half a say where they ask for one more surely than for the best
+    that select spots do not gain much less with.
 
     Args:
         best: in its place.
         trials: there.
         block: ``[S]`` wall block of each select spot.
-        least: weight above which it cannot.
+        share: weight above which it cannot.
+        least: nats by which fitted spots ask for one more surely.
 
     Returns:
         weights by name, the best's first.
     """
     kind = [t for t in trials if t.candidate and (t.name in FREE_NAMES) == (best.name in FREE_NAMES)]
     shares = dict(zip([t.name for t in kind], weights([t.likelihood for t in kind], block), strict=True))
-    left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > least}
+    near = [t for t in kind if t.gain.nats >= MOST * best.gain.nats]
+    asked = max([best, *near], key=evidence_of)
+    if evidence_of(asked) > evidence_of(best) + least:
+        shares = {name: (weight + (name == asked.name)) / 2 for name, weight in shares.items()}
+    left = {best.name: shares[best.name]} | {n: w for n, w in shares.items() if w > share}
     return {name: weight / sum(left.values()) for name, weight in left.items()}
+
+
+def evidence_of(trial: Trial) -> float:
+    """Nats of the pool for a trial's term; 0 for none."""
+    return 0.0 if trial.candidate is None else trial.candidate.evidence

@@ -122,6 +122,8 @@ def build_problem(
     size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
+    # All albedos do what it does, and with it what light does that bounced twice: theirs is of the third bounce.
+    response.pop("model.laser_sensor.intensity.raw")
     for part in spots.split(size):
         with torch.no_grad():
             light.append(model.arrived(part, extension))

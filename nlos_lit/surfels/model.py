@@ -432,9 +432,10 @@ class SurfelModel(nn.Module):
         Returns:
             ``[B, T]`` from the capture's bin 0 to the gate's end.
         """
-        energy, time = self.arrivals(paths, spots, hooks, self.albedo() if albedo is None else albedo)
+        albedo = self.albedo() if albedo is None else albedo
+        energy, time = self.arrivals(paths, spots, hooks, albedo)
         transients = SplineSplat.apply(energy.flatten(1), time.flatten(1), self.n_bins)
-        return hooks.transients(transients, energy, paths, spots)
+        return hooks.transients(transients, energy, albedo, paths, spots)
 
     def arrived(self, spots: Tensor, hooks: Hooks, placed: tuple[Tensor, Tensor] | None = None) -> Tensor:
         """Stages 1 to 3.

@@ -86,7 +86,8 @@ class _Linear(NamedTuple):
         energy, time = model.arrivals(paths, spots, hooks, torch.ones_like(albedo))
         runs = Runs.of(energy, time, model.n_bins)
         direct = runs.send(albedo)
-        return cls(spots, runs, hooks.transients(direct, energy * albedo[:, None], paths, spots) - direct)
+        whole = hooks.transients(direct, energy * albedo[:, None], albedo, paths, spots)
+        return cls(spots, runs, whole - direct)
 
 
 def solve_albedos(

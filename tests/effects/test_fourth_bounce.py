@@ -74,9 +74,9 @@ def all_pairs(capture: Capture, model: SurfelModel) -> tuple[np.ndarray, np.ndar
 def fourth(capture: Capture, model: SurfelModel) -> np.ndarray:
     effect, spots = HigherOrderBounces(Scan.of(capture)), torch.arange(capture.n_spots)
     with torch.no_grad():
-        paths = model.paths(spots)
-        energy = paths.contribution * model.albedo()[:, None]
-        return effect.fourth_bounce(energy, paths, spots, N_BINS).double().numpy()
+        paths, albedo = model.paths(spots), model.albedo()
+        energy = paths.contribution * albedo[:, None]
+        return effect.fourth_bounce(energy, albedo, paths, spots, N_BINS).double().numpy()
 
 
 @pytest.mark.parametrize("confocal", [True, False])
@@ -141,6 +141,31 @@ def test_clusters_are_few_and_whole():
     assert member.shape[1] > CLUSTERS / 3
 
 
+def test_a_grazing_surfel_sends_no_more_than_its_area():
+    """A spot sees the last one, which is curved, edge-on at its centre, and one half of it from above."""
+    capture, model = valley(True)
+    centre, normal, albedo = (v.detach() for v in (model.centre(), model.normal(), model.albedo()))
+    away = torch.nn.functional.normalize(centre[-1] - torch.as_tensor(capture.laser[0]).float(), dim=0)
+    normal[-1] = torch.nn.functional.normalize(away[2] * away - torch.tensor([0.0, 0.0, 1.0]), dim=0)
+    model.place(centre, normal, albedo)
+    model.curvature[-1] = 2.0 * (torch.eye(3) - torch.outer(normal[-1], normal[-1]))
+    assert fourth(capture, model).sum(1) == pytest.approx(all_pairs(capture, model)[0], rel=0.04)
+
+
+def test_strength_is_the_mean_albedo():
+    """Two equal faces: the fourth bounce is strength times that of albedo 1, whatever surfels call theirs."""
+    capture, model = valley(True)
+    effect, spots = HigherOrderBounces(Scan.of(capture)), torch.arange(capture.n_spots)
+    effect.set("strength", 0.4)
+    for relative in (1.0, 30.0):
+        with torch.no_grad():
+            paths, albedo = model.paths(spots), torch.ones(len(model))
+            dark, light = torch.zeros(capture.n_spots, N_BINS), paths.contribution
+            more = effect.transients(dark, relative * light, relative * albedo, paths, spots)
+            white = effect.fourth_bounce(light, albedo, paths, spots, N_BINS)
+        assert more.sum(1).numpy() == pytest.approx(0.4 * relative * white.sum(1).numpy(), rel=1e-4)
+
+
 def test_share_is_known_after_a_rendering():
     model, scan = scene("confocal")
     bounces, spots = HigherOrderBounces(scan), torch.arange(10)
@@ -164,6 +189,7 @@ def test_surfels_in_the_same_place_keep_it_finite():
     spots = torch.arange(capture.n_spots)
     paths = model.paths(spots)
     effect = HigherOrderBounces(Scan.of(capture))
-    effect.fourth_bounce(paths.contribution * model.albedo()[:, None], paths, spots, N_BINS).sum().backward()
+    albedo = model.albedo()
+    effect.fourth_bounce(paths.contribution * albedo[:, None], albedo, paths, spots, N_BINS).sum().backward()
     for parameter in (model.raw_depth, model.raw_normal, model.raw_albedo):
         assert parameter.grad.isfinite().all()

@@ -269,7 +269,20 @@ def test_trials_stand_by_gain_with_their_weights():
 def test_the_edge_of_a_group(less, names):
     """Where all patches say the same, a weight of a twentieth is 2.94 nats."""
     trials = [gained("irf_tail", 100.0), gained("pile_up", 100.0 - less)]
-    assert group_of(trials[0], trials, BLOCK, 0.05).keys() == names
+    assert group_of(trials[0], trials, BLOCK, 0.05, LEAST).keys() == names
+
+
+def test_fitted_spots_have_half_a_say_in_a_group():
+    """Where they ask by more than 8 nats for another that gains nine tenths as much on select spots."""
+
+    def group(more: float, gain: float) -> dict[str, float]:
+        lines, drift = gained("line_delay", 100.0), gained("time_drift", gain)
+        drift = replace(drift, candidate=candidate("time_drift", lines.candidate.evidence + more))
+        return group_of(lines, [lines, drift], BLOCK, 0.05, LEAST)
+
+    assert list(group(LEAST + 0.1, 90.1)) == ["line_delay", "time_drift"]
+    assert list(group(LEAST + 0.1, 90.1).values()) == pytest.approx([0.5, 0.5], abs=1e-3)
+    assert group(LEAST - 0.1, 90.1).keys() == group(LEAST + 0.1, 89.9).keys() == {"line_delay"}
 
 
 def names_of(members: list[Member]) -> list[str]:

@@ -127,7 +127,7 @@ def test_effects_stand_still_and_are_seen_through():
 
 def test_fourth_bounces_stay_what_they_are():
     """They are no linear function of the albedos."""
-    fourth = Extension([effect_of("higher_order_bounces", Scan.of(WALL), strength=40.0)])
+    fourth = Extension([effect_of("higher_order_bounces", Scan.of(WALL), strength=4.0)])
 
     def corner(albedo: float) -> SurfelModel:
         model = board(torch.full((5, 5), albedo))
