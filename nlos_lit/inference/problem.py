@@ -5,8 +5,8 @@ Rows are gated bins of the looked-at spots, divided by √μ, so that counts of 
 variance.
 
 - ``X [N, P]``: nuisance, what the base may do by itself: each surfel's albedo and depth, where each patch of
-  the scene lies along x and y, the laser-sensor response, what passes the sheets in front, how far rims roll
-  off, and the parameters of effects that were accepted before.
+  the scene lies along x and y, the laser-sensor response without the intensity, what passes the sheets in
+  front, how far rims roll off, and the parameters of effects that were accepted before.
 - ``U [N, Q]``: how bright each patch is from where on the wall, all alike unknown by a deviation of its own.
 - ``r [N]``: residual (counts - μ)/√μ.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
@@ -122,7 +122,8 @@ def build_problem(
     size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))
     surfels, others, light = [], [], []
     response = {f"model.laser_sensor.{n}": p.detach() for n, p in model.laser_sensor.named_parameters()}
-    # All albedos do what it does, and with it what light does that bounced twice: theirs is of the third bounce.
+    # Albedos do by themselves what the intensity does. Their columns are of the third bounce alone, and with
+    # the intensity's, which is of all light, they would do whatever the fourth does.
     response.pop("model.laser_sensor.intensity.raw")
     for part in spots.split(size):
         with torch.no_grad():

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import torch
 from effect_contract import scene, surfels
+from inference_scenes import FORWARD_MODE
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.higher_order_bounces import CLUSTERS, HigherOrderBounces, clusters
+from nlos_lit.inference.evidence import Projector
+from nlos_lit.inference.problem import build_problem, weighted_columns
 from nlos_lit.surfels.model import SurfelModel
 
 BIN, T_START, N_BINS = 0.01, 0.5, 400
@@ -176,6 +179,20 @@ def test_share_is_known_after_a_rendering():
     # All light of this scene falls into the record, but for the tail of the response.
     assert (more.sum() / plain.sum() - 1).item() == pytest.approx(share, rel=0.1)
     assert share > 1e-4
+
+
+@FORWARD_MODE
+def test_a_scene_cannot_do_it_by_a_change_of_its_brightness():
+    """Beside a model that has it, it is not what all albedos and the intensity do against each other."""
+    capture, model = valley(True)
+    effect, spots = HigherOrderBounces(Scan.of(capture)), torch.arange(capture.n_spots)
+    effect.set("strength", 0.9)
+    model.laser_sensor.set_intensity(1e4)
+    extension = Extension([effect])
+    counts = model.expected(spots, extension).detach()
+    problem = build_problem(model, extension, spots, counts, with_effects=False, patches=8)
+    column = weighted_columns(problem, effect)
+    assert Projector(problem).free(column).norm() > 0.05 * column.norm()
 
 
 def test_surfels_in_the_same_place_keep_it_finite():
