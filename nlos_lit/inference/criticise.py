@@ -92,6 +92,8 @@ class CriticismSettings:
 def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
     """How much likelier than by the fit some counts would be if all but counting noise were explained.
 
+    Numbers of single spots are solved for: no fit can know those of spots that it has not seen.
+
     Args:
         fit: that is judged.
         spots: ``[S]`` rows of the capture.
@@ -100,6 +102,11 @@ def misfit_of(fit: SurfelFit, spots: np.ndarray, number: int) -> float:
     Returns:
         nats, half the deviance above the noise's; below 0 where surfels have taken up noise.
     """
+    if any(e.per_spot for e in fit.extension.effects):
+        fit = copy.copy(fit)
+        fit.extension, fit.train = copy_effects(fit.extension, []), torch.from_numpy(spots)
+        fit.counts = torch.from_numpy(fit.capture.gated_counts()[spots])
+        solve_spots(fit)
     found = score(fit, spots)
     return 0.5 * (found.deviance_per_bin - found.deviance_noise) * number * fit.counts.shape[1]
 

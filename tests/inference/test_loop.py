@@ -191,7 +191,7 @@ def trial(name: str, likelihood: Tensor) -> Trial:
 
 def test_misfit_is_half_the_deviance_above_the_noise(monkeypatch):
     """In 20 bins of 3 spots, 0.5 above 0.9 a bin: 15 nats, however many are looked at; 0.1 below it: -3."""
-    fit = SimpleNamespace(counts=torch.zeros(9, 20))
+    fit = SimpleNamespace(counts=torch.zeros(9, 20), extension=Extension([]))
     for deviance, nats in ((1.4, 15.0), (0.8, -3.0)):
         found = SimpleNamespace(deviance_per_bin=deviance, deviance_noise=0.9)
         monkeypatch.setattr(loop, "score", lambda *_, found=found: found)

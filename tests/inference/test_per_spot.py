@@ -14,6 +14,7 @@ from scipy import integrate
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.criticise import misfit_of
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.per_spot import (
     best_width,
@@ -176,6 +177,20 @@ def test_unseen_spots_still_say_whether_the_width_is_right():
         ]
         assert bool(values[0] > values[1] + 20) is better
         assert bool(values[0] < values[1]) is not better
+
+
+def test_what_no_fit_can_know_is_no_misfit():
+    """Jitter of 3 bins at spots that were not solved: a misfit of the model without it, but not with it."""
+    scene = capture_of(raster(8))
+    model, scan, spots = surfels(scene, level=40.0), Scan.of(scene), np.arange(64)
+    delays = 3 * scan.bin_length * torch.from_numpy(np.random.default_rng(2).standard_normal(64)).float()
+    measured = drawn(model, Extension([effect_of("timing_jitter", scan, offset=delays)]), scene, seed=4)
+    effect = effect_of("timing_jitter", scan)
+    without, with_it = fit_of(model, measured), fit_of(model, measured, Extension([effect]))
+    nothing = misfit_of(fit_of(model, drawn(model, Extension([]), scene, seed=4)), spots, 64)
+    assert misfit_of(without, spots, 64) > nothing + 200
+    assert abs(misfit_of(with_it, spots, 64) - nothing) < 0.1 * (misfit_of(without, spots, 64) - nothing)
+    assert not effect.value("offset").any(), "it is asked of a copy"
 
 
 def test_neighbours_are_the_nearest_on_the_wall():
