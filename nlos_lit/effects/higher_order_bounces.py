@@ -142,7 +142,8 @@ def clusters(centre: Tensor) -> tuple[Tensor, float]:
     cell = max(float(away.max()) / CLUSTERS, 1e-6)
     sides = torch.tensor([1, 2 * CLUSTERS, 4 * CLUSTERS**2], device=centre.device)
     while True:
-        cubes, index = torch.unique(torch.floor(away / cell).long() @ sides, return_inverse=True)
+        cube = (torch.floor(away / cell).long() * sides).sum(1)
+        cubes, index = torch.unique(cube, return_inverse=True)
         if len(cubes) <= CLUSTERS:
             return torch.nn.functional.one_hot(index, len(cubes)).to(centre.dtype), cell
         cell *= 1.15
