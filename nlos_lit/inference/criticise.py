@@ -262,7 +262,8 @@ class Loop:
         are also built with all effects of each kind that scenes imitate, from the first surfel on. The best
         is taken where it surely predicts better than the base, and, when it has become as fine, than the fine
         scene without any. Where there are no such effects they are a burden, or the scene is a luckier one:
-        where it is as good without them, it is the base.
+        where it is as good without them, it is the base. They may also do a little of what is there; so,
+        where they are taken, a scene with what the counts ask for together is built in the same way.
 
         Args:
             base: without effects, parsimonious.
@@ -273,9 +274,11 @@ class Loop:
             The effects that are there, if any, and the scenes with them; nobody was asked whether they hold.
         """
         found = [Held([], fine, base)]
-        for kind, imitated in enumerate(IMITATED):
-            members = [Member(c) for c in pool.candidates if c.name in imitated]
-            if not members:
+        asked = [Member(t.candidate) for t in pool.together if not t.candidate.free]
+        imitated = [[Member(c) for c in pool.candidates if c.name in kind] for kind in IMITATED]
+        known = any({m.name for m in asked} <= kind for kind in IMITATED)  # or nothing is asked for
+        for kind, members in enumerate([*imitated, asked]):
+            if not members or (members is asked and (known or len(found) == 1)):
                 continue
             extension = copy_effects(Extension([]), [self._at_first(m.candidate, base) for m in members])
             self.steps.plan(fit=1)

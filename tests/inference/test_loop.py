@@ -340,6 +340,28 @@ def test_of_the_kinds_that_scenes_imitate_the_better_one_is_begun_with(monkeypat
     assert [names for names, _ in world.rebuilt] == [{"irf_tail"}, {"wall_scale"}]
 
 
+@pytest.mark.parametrize(
+    ("imitated", "asked", "taken"),
+    [(40.0, 50.0, "time_drift"), (50.0, 40.0, "irf_tail"), (2.9, 50.0, "")],
+)
+def test_what_is_asked_for_is_begun_with_where_it_does_more(monkeypatch, imitated, asked, taken):
+    """Where what scenes imitate would be taken, a scene is built with what the counts ask for together, too,
+    unless that is all of one kind.
+    """
+    pool = [candidate("time_drift", 50.0), candidate("irf_tail", 0.0), candidate("free_scan", 60.0)]
+    table = {"anew+irf_tail": nats(imitated), "anew+time_drift": nats(asked)}
+    table |= {"fine+anew+irf_tail": nats(60.0), "fine+anew+time_drift": nats(60.0)}
+    world = World(monkeypatch, table, pool, imitated=(("irf_tail", "ambient_map"),))
+    taking = [Taken(pool[0], []), Taken(pool[2], [])]
+    held = world.loop().begun(fitted(), fitted(fine=True), Pool(pool, taking))
+    assert names_of(held.members) == [taken] * bool(taken)
+    assert (held.scene.names, held.coarse.names) == (({taken},) * 2 if taken else (set(), set()))
+    built = [{"irf_tail"}, {"time_drift"}][: 1 + (imitated > 3)]
+    assert [names for names, _ in world.rebuilt] == built
+    world.loop().begun(fitted(), fitted(fine=True), Pool(pool, [Taken(pool[1], [])]))
+    assert [names for names, _ in world.rebuilt[len(built) :]] == [{"irf_tail"}]
+
+
 def test_a_scene_begins_with_echoes_where_the_counts_repeat_or_the_pool_asks(monkeypatch):
     base, seen = fitted(), []
     base.counts = torch.ones(3, 5)
