@@ -80,6 +80,11 @@ class DirectTail(Effect):
         )
 
     @classmethod
+    def same_as(cls, scan: Scan) -> str:
+        distance = separation(scan)
+        return "direct_leak" if bool(distance.amax() == distance.amin()) else ""
+
+    @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"amplitude": 5 * scan.background}
 

@@ -274,7 +274,7 @@ class Loop:
             The effects that are there, if any, and the scenes with them; nobody was asked whether they hold.
         """
         found = [Held([], fine, base)]
-        asked = [Member(t.candidate) for t in pool.together if not t.candidate.free]
+        asked = [Member(t.candidate, t.rivals) for t in pool.together if not t.candidate.free]
         imitated = [[Member(c) for c in pool.candidates if c.name in kind] for kind in IMITATED]
         known = any({m.name for m in asked} <= kind for kind in IMITATED)  # or nothing is asked for
         for kind, members in enumerate([*imitated, asked]):
@@ -794,8 +794,7 @@ class Loop:
         itself, none = member.trials
         have = {e.name for e in none.fit.extension.effects}  # those that came since and hold beside it
         rivals = [c for c in member.rivals if c.name not in have][: s.rivals]
-        known = have | {c.name for c in rivals}
-        rivals += [c for c in left if c.name not in known]
+        rivals = _in_order(*rivals, *(c for c in left if c.name not in have))
         jobs = [
             (
                 f"going on with {c.name} for {member.name}",
@@ -935,7 +934,7 @@ def criticise(
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)
-        new = [replace(m, rivals=rivals) for m in new]
+        new = [replace(m, rivals=_in_order(*m.rivals, *rivals)) for m in new]
         found.members = found.members + new
         told(first, coarse, found.members)
     effects = with_those(joined_by(new, free=False), start)
@@ -974,6 +973,14 @@ def _sharing(members: list[Member]) -> list[Member]:
     """Who of some members that all stay leaves, where one lacks only what others take."""
     unnamed = [m for m in members if not m.accepted]
     return sorted(unnamed, key=_gain)[:1] if any(m.stands_in for m in unnamed) else []
+
+
+def _in_order(*candidates: Candidate) -> list[Candidate]:
+    """Each once, as they first come."""
+    found = dict[str, Candidate]()
+    for candidate in candidates:
+        found.setdefault(candidate.name, candidate)
+    return list(found.values())
 
 
 def _named(members: list[Member]) -> int:

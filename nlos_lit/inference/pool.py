@@ -171,7 +171,7 @@ def ask(
     effects: bool = True,
     only: Container[str] | None = None,
 ) -> Pool:
-    """Every term that the fit does not have yet.
+    """Every term that the fit does not have yet, and that is none of its own by another name.
 
     Args:
         fit: that is criticised.
@@ -189,9 +189,10 @@ def ask(
     """
     problem, block = _problem(fit, split, most, seed)
     projector = Projector(problem)
-    have = {e.name for e in fit.extension.effects}
-    terms = [e for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
-    found = screen(problem, [e(scan) for e in terms if e.name not in have], block, projector)
+    terms = [e(scan) for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
+    have = fit.extension.effects
+    new = [e for e in terms if not any(e.name == h.name or e.twin_of(h) for h in have)]
+    found = screen(problem, new, block, projector)
     taken = together(problem, projector, block, found, least, room, effects)
     return Pool(found, taken, foreign(found, least) if effects and room else None)
 
@@ -228,10 +229,10 @@ def together(
 
     Strong faults hide one another, and the same trace may be that of several terms. So the one that is asked
     for most is taken, its columns go to what the base can do by itself, and all others are asked again. Who
-    loses more than half of its evidence by that is a look-alike, and waits: what is left of it may be what
-    one linear step of the first gets wrong. Of those that have most of the largest evidence the simplest is
-    taken. Free terms are taken only where no effect is: a scene that was fitted with one has less need of the
-    effect that it stands for.
+    loses more than half of its evidence by that is a look-alike, and waits, as does what is the same in such
+    a scan: what is left of it may be what one linear step of the first gets wrong. Of those that have most of
+    the largest evidence the simplest is taken. Free terms are taken only where no effect is: a scene that was
+    fitted with one has less need of the effect that it stands for.
 
     Args:
         problem: of the tested spots.
@@ -274,7 +275,8 @@ def together(
             known.append((freed[first.name], (first.scale * deviation).pow(-2).float()))
             before = [c for c in asked if c is not first]
             asked = beside(before)
-            rivals = lost(before, asked, least)
+            same = [c for c in before if c.effect.twin_of(first.effect)]
+            rivals = same + [c for c in lost(before, asked, least) if not c.effect.twin_of(first.effect)]
             ahead = [] if free or taken else [c for c in candidates if _leads(c, first)][:1]
             taken.append(Taken(first, ahead + rivals))
             waiting = {c.name for c in rivals}

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import evidence as evidence_module
 from nlos_lit.inference import pool
 from nlos_lit.inference.evidence import (
@@ -571,6 +572,33 @@ def test_a_look_alike_waits_until_the_first_is_in_the_model(alike, monkeypatch):
     for second, more in ((0.0, ["free_rate"]), (-1.0, [])):
         found = taken([2.0, second, 1.0], alike, 9)
         assert found == [("irf_tail", [*more, "time_offset"]), ("pile_up", [])]
+
+
+@pytest.mark.parametrize("same", [False, True])
+def test_what_is_the_same_in_such_a_scan_comes_never_beside_it(alike, monkeypatch, same):
+    """Two exponentials of one scene's leak would else be two names of one cause; it is the first rival."""
+    for name, shares in (("direct_leak", [1.0, 0.0, 0.2]), ("direct_tail", [0.0, 1.0, 0.0])):
+        monkeypatch.setitem(ALIKE, name, (shares, 0))
+    other = "direct_leak" if same else ""
+    monkeypatch.setattr(type(effect_of("direct_tail", SCAN)), "same_as", lambda *_: other)
+    for name in ("irf_tail", "afterpulsing", "free_rate"):
+        monkeypatch.delitem(ALIKE, name)
+    found = dict(taken([3.0, 1.0, 0.0], alike, 9))
+    assert found["direct_leak"] == ["direct_tail"] * same
+    assert ("direct_tail" in found) is not same
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("confocal", False), ("single", True)])
+def test_what_a_fit_has_by_another_name_is_not_asked_for(monkeypatch, kind, asked):
+    scan, names = Scan.of(capture_of(scattered(SPOTS), kind)), list[str]()
+    monkeypatch.setattr(pool, "_problem", lambda *_: (None, BLOCK))
+    monkeypatch.setattr(pool, "Projector", lambda problem: None)
+    monkeypatch.setattr(pool, "together", lambda *_: [])
+    monkeypatch.setattr(pool, "screen", lambda p, effects, *_: names.extend(e.name for e in effects) or [])
+    pool.ask(SimpleNamespace(extension=Extension([effect_of("direct_leak", scan)])), None, scan, 9, 0)
+    assert ("direct_tail" in names) is asked
+    assert "direct_leak" not in names
+    assert "irf_tail" in names
 
 
 def test_a_term_with_a_prior_keeps_its_scale(known):
