@@ -703,9 +703,6 @@ class Loop:
     def named(self, members: list[Member], scene: SurfelFit) -> tuple[list[Member], SurfelFit]:
         """The terms that hold, each held against its rivals.
 
-        Of an effect those are such, too, that the counts asked for and that did not hold beside it: of two
-        that leave the same trace one leaves.
-
         Args:
             members: that were tried.
             scene: with those that hold.
@@ -715,12 +712,9 @@ class Loop:
             leaves.
         """
         have = {m.name for m in members if m.accepted}
-        asked = [m.candidate for m in members if not m.accepted and m.candidate.evidence > self.least]
-        left = [c for c in asked if not c.free and not c.effect.per_spot]
         settled, gone, came = list[Member](), list[str](), list[Member]()
         for member in members:
-            others = () if member.candidate.free else left
-            now = self.settled(member, others) if member.accepted else member
+            now = self.settled(member) if member.accepted else member
             if now.name != member.name:
                 gone.append(member.name)
                 if now.name in have:
@@ -780,12 +774,11 @@ class Loop:
         s = self.settings
         return self.least + s.share * lit * misfit + s.form * lost
 
-    def settled(self, member: Member, left: Sequence[Candidate] = ()) -> Member:
+    def settled(self, member: Member) -> Member:
         """A member with what its rivals are worth in its place.
 
         Args:
             member: that holds.
-            left: effects that did not hold beside it.
 
         Returns:
             The member, with the simplest of those that gain most as its term.
@@ -794,7 +787,6 @@ class Loop:
         itself, none = member.trials
         have = {e.name for e in none.fit.extension.effects}  # those that came since and hold beside it
         rivals = [c for c in member.rivals if c.name not in have][: s.rivals]
-        rivals = _in_order(*rivals, *(c for c in left if c.name not in have))
         jobs = [
             (
                 f"going on with {c.name} for {member.name}",

@@ -978,21 +978,6 @@ def test_what_cannot_be_told_apart_is_a_group(monkeypatch):
     assert {t.name for t in member.trials} == {"wall_reflectance", "hum", "pile_up", "none"}, "two rivals"
 
 
-def test_who_left_beside_a_term_may_be_meant(monkeypatch):
-    """A leak and the direct light's tail are the same where the scan is confocal: both come, one leaves, and
-    the other is told of with it. A slope that the counts had asked for is tried and does less.
-    """
-    both = gaining(20.0)
-    table = {"direct_tail": both, "direct_leak": both - per_spot(0.01, 1), "background_slope": nats(5.0)}
-    names = "background_slope", "direct_leak", "direct_tail"
-    for some in (names, names[:2], names[1:], names[::2]):
-        table |= {"+".join([*state, *some]): both for state in ([], ["fine"], ["anew"], ["fine", "anew"])}
-    own = {"direct_tail": 20.0, "direct_leak": 0.0, "background_slope": 0.0}
-    (member,) = World(monkeypatch, table, [candidate(n) for n in own], own).criticise().accepted
-    assert list(member.group) == ["direct_tail", "direct_leak"]
-    assert {t.name for t in member.trials} == {"none", *names}
-
-
 def test_a_rival_that_holds_beside_a_term_does_not_take_its_place(monkeypatch):
     """It waited until the term was in the model, was asked for again and came; it is there once."""
     table = {"wall_reflectance": nats(50.0), "vignetting": nats(60.0)}
