@@ -418,6 +418,24 @@ def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):
     assert member.name == "pile_up"
 
 
+def test_rivals_of_what_is_asked_for_come_first(monkeypatch):
+    """A scene is begun with a drift, of which a line's delay is the rival; a leak loses its evidence, too."""
+    pool = [candidate("time_drift", 50.0), candidate("irf_tail", 0.0), candidate("line_delay", 50.0)]
+    pool.append(candidate("direct_leak", 60.0))
+    table = {"anew+irf_tail": nats(20.0), "anew+time_drift": nats(30.0), "time_drift": nats(30.0)}
+    table |= {"fine+anew+irf_tail": nats(20.0), "fine+anew+time_drift": nats(30.0)}
+    world = World(monkeypatch, table, pool, {"time_drift": 50.0}, imitated=(("irf_tail",),))
+
+    def asked(fit, *_):
+        left = [replace(c, evidence=0.0) if "time_drift" in fit.names else c for c in pool]
+        left = [c for c in left if c.name not in fit.names]
+        return Pool(left, [] if fit.names else [Taken(pool[0], [pool[2]])])
+
+    monkeypatch.setattr(loop, "ask", asked)
+    (member,) = world.criticise().members
+    assert (member.name, names_of(member.rivals)) == ("time_drift", ["line_delay", "direct_leak"])
+
+
 def test_a_term_that_is_there_takes_no_second_place(monkeypatch):
     """It came since, and predicts more than the member whose place it is tried in: that leaves."""
     table = {"irf_tail": nats(20.0), "free_rate": nats(40.0)}
