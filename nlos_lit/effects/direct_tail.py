@@ -80,13 +80,11 @@ class DirectTail(Effect):
         )
 
     @classmethod
-    def same_as(cls, scan: Scan) -> str:
-        distance = separation(scan)
-        return "direct_leak" if bool(distance.amax() == distance.amin()) else ""
-
-    @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"amplitude": 5 * scan.background}
+
+    def same_as(self) -> str:
+        return "direct_leak" if bool(self.distance.amax() == self.distance.amin()) else ""
 
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         middles = torch.arange(self.scan.n_bins, dtype=background.dtype, device=background.device) + 0.5

@@ -99,14 +99,13 @@ class Effect(nn.Module, Hooks):
         """A strength that is clearly visible, by the names of :meth:`settable`; shapes are left out."""
         raise NotImplementedError
 
-    @classmethod
-    def same_as(cls, scan: Scan) -> str:
-        """Name of another effect that is exactly this one in such a scan; empty where there is none."""
+    def same_as(self) -> str:
+        """Name of another effect that is exactly this one in its scan; empty where there is none."""
         return ""
 
     def twin_of(self, other: Effect) -> bool:
         """Whether one of the two is the other in its scan: they may be meant alike, and never both."""
-        return self.name == other.same_as(self.scan) or other.name == self.same_as(self.scan)
+        return self.name == other.same_as() or other.name == self.same_as()
 
     def value(self, name: str) -> Tensor:
         """``[size]`` (a scalar for size 1) in the parameter's unit."""

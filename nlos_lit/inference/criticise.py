@@ -38,7 +38,7 @@ from nlos_lit.inference.members import (
     weighed,
 )
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, Pool, ask, lost, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ask, each_once, lost, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -926,7 +926,7 @@ def criticise(
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)
-        new = [replace(m, rivals=_in_order(*m.rivals, *rivals)) for m in new]
+        new = [replace(m, rivals=each_once(*m.rivals, *rivals)) for m in new]
         found.members = found.members + new
         told(first, coarse, found.members)
     effects = with_those(joined_by(new, free=False), start)
@@ -965,14 +965,6 @@ def _sharing(members: list[Member]) -> list[Member]:
     """Who of some members that all stay leaves, where one lacks only what others take."""
     unnamed = [m for m in members if not m.accepted]
     return sorted(unnamed, key=_gain)[:1] if any(m.stands_in for m in unnamed) else []
-
-
-def _in_order(*candidates: Candidate) -> list[Candidate]:
-    """Each once, as they first come."""
-    found = dict[str, Candidate]()
-    for candidate in candidates:
-        found.setdefault(candidate.name, candidate)
-    return list(found.values())
 
 
 def _named(members: list[Member]) -> int:

@@ -171,7 +171,7 @@ def ask(
     effects: bool = True,
     only: Container[str] | None = None,
 ) -> Pool:
-    """Every term that the fit does not have yet, and that is none of its own by another name.
+    """Every term that the fit does not have yet.
 
     Args:
         fit: that is criticised.
@@ -182,16 +182,18 @@ def ask(
         least: nats that a term needs to be taken.
         room: for terms that are taken together.
         effects: such are asked, too, and may be taken.
-        only: names of those that are asked; None asks all.
+        only: names of those that are asked; None asks all but what the fit has by another name.
 
     Returns:
         candidates with a copy of each effect at its best shape, and those that are asked for together.
     """
     problem, block = _problem(fit, split, most, seed)
     projector = Projector(problem)
-    terms = [e(scan) for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
-    have = fit.extension.effects
-    new = [e for e in terms if not any(e.name == h.name or e.twin_of(h) for h in have)]
+    have = {e.name for e in fit.extension.effects}
+    terms = [e for e in [*(EFFECTS if effects else ()), *FREE] if only is None or e.name in only]
+    new = [e(scan) for e in terms if e.name not in have]
+    if only is None:
+        new = [e for e in new if not any(map(e.twin_of, fit.extension.effects))]
     found = screen(problem, new, block, projector)
     taken = together(problem, projector, block, found, least, room, effects)
     return Pool(found, taken, foreign(found, least) if effects and room else None)
@@ -276,7 +278,7 @@ def together(
             before = [c for c in asked if c is not first]
             asked = beside(before)
             same = [c for c in before if c.effect.twin_of(first.effect)]
-            rivals = same + [c for c in lost(before, asked, least) if not c.effect.twin_of(first.effect)]
+            rivals = each_once(*same, *lost(before, asked, least))
             ahead = [] if free or taken else [c for c in candidates if _leads(c, first)][:1]
             taken.append(Taken(first, ahead + rivals))
             waiting = {c.name for c in rivals}
@@ -299,6 +301,14 @@ def lost(before: list[Candidate], now: list[Candidate], least: float) -> list[Ca
     known = [c for c in before if c.name in left and not c.effect.per_spot]
     found = [c for c in known if c.evidence > max(least, 2 * left[c.name])]
     return sorted(found, key=lambda c: -c.evidence)
+
+
+def each_once(*candidates: Candidate) -> list[Candidate]:
+    """Each once, as they first come."""
+    found = dict[str, Candidate]()
+    for candidate in candidates:
+        found.setdefault(candidate.name, candidate)
+    return list(found.values())
 
 
 def _leads(candidate: Candidate, effect: Candidate) -> bool:

@@ -275,7 +275,7 @@ def test_the_direct_tail_falls_off_with_distance():
     sensor = [[0.0, 0.0, 0.0]] * 3
     scan = hand_scan([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.4, 0.0]], sensor)
     tail = effect("direct_tail", scan=scan, amplitude=9.0, decay=0.25, reach=0.5)
-    assert tail.same_as(scan) == ""
+    assert tail.same_as() == ""
     seen = tail.background(torch.tensor(1.0), torch.arange(3)).detach()
     falloff = [1.0, (0.5 / 0.8) ** 2, 0.25]
     by_hand = [1 + 9 * k * math.exp(-late / 0.25) for k, late in zip(falloff, (0.5, 0.2, 0.0), strict=True)]
@@ -305,7 +305,7 @@ def test_the_direct_tail_of_a_confocal_scan_is_a_leak():
     seen = tail.background(torch.tensor(2.0), torch.arange(3)).detach()
     assert seen[:, FIRST:] == pytest.approx(leak[FIRST:].detach().expand(3, -1), rel=1e-5)
     assert tail.declared["reach"].grid == (tail.scan.half,)
-    assert tail.same_as(tail.scan) == "direct_leak"
+    assert tail.same_as() == "direct_leak"
     assert tail.twin_of(effect("direct_leak"))
     assert effect("direct_leak").twin_of(tail)
     assert not tail.twin_of(effect("background_slope"))

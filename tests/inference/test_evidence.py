@@ -588,17 +588,28 @@ def test_what_is_the_same_in_such_a_scan_comes_never_beside_it(alike, monkeypatc
     assert ("direct_tail" in found) is not same
 
 
-@pytest.mark.parametrize(("kind", "asked"), [("confocal", False), ("single", True)])
-def test_what_a_fit_has_by_another_name_is_not_asked_for(monkeypatch, kind, asked):
-    scan, names = Scan.of(capture_of(scattered(SPOTS), kind)), list[str]()
+def asked_beside(name: str, scan: Scan, monkeypatch, only: list[str] | None = None) -> list[str]:
+    """Names of what is asked for beside a fit that has one effect."""
+    names = list[str]()
     monkeypatch.setattr(pool, "_problem", lambda *_: (None, BLOCK))
     monkeypatch.setattr(pool, "Projector", lambda problem: None)
     monkeypatch.setattr(pool, "together", lambda *_: [])
     monkeypatch.setattr(pool, "screen", lambda p, effects, *_: names.extend(e.name for e in effects) or [])
-    pool.ask(SimpleNamespace(extension=Extension([effect_of("direct_leak", scan)])), None, scan, 9, 0)
+    pool.ask(SimpleNamespace(extension=Extension([effect_of(name, scan)])), None, scan, 9, 0, only=only)
+    return names
+
+
+@pytest.mark.parametrize(("kind", "asked"), [("confocal", False), ("single", True)])
+def test_what_a_fit_has_by_another_name_is_not_asked_for(monkeypatch, kind, asked):
+    names = asked_beside("direct_leak", Scan.of(capture_of(scattered(SPOTS), kind)), monkeypatch)
     assert ("direct_tail" in names) is asked
     assert "direct_leak" not in names
     assert "irf_tail" in names
+
+
+def test_what_is_asked_for_by_name_is_asked_whatever_the_fit_has(monkeypatch):
+    """A further capture may be confocal where the first, whose names are open, was not."""
+    assert asked_beside("direct_leak", SCAN, monkeypatch, ["direct_tail"]) == ["direct_tail"]
 
 
 def test_a_term_with_a_prior_keeps_its_scale(known):
