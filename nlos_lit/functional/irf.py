@@ -144,6 +144,7 @@ class _Convolution(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         transients, kernel, ctx.lead = inputs
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(transients, kernel)
         ctx.save_for_forward(transients, kernel)
 
@@ -163,12 +164,9 @@ class _Convolution(torch.autograd.Function):
     @staticmethod
     def jvp(ctx: Any, d_transients: Tensor | None, d_kernel: Tensor | None, _: None) -> Tensor:
         transients, kernel = ctx.saved_tensors
-        changed = torch.zeros_like(transients)
-        if d_transients is not None:
-            changed = changed + convolve_time(d_transients, kernel, ctx.lead)
-        if d_kernel is not None:
-            changed = changed + convolve_time(transients, d_kernel, ctx.lead)
-        return changed
+        changes = [] if d_transients is None else [convolve_time(d_transients, kernel, ctx.lead)]
+        changes += [] if d_kernel is None else [convolve_time(transients, d_kernel, ctx.lead)]
+        return sum(changes[1:], changes[0])
 
 
 def _whole(transients: Tensor, kernel: Tensor) -> int:

@@ -174,6 +174,26 @@ def splat(light, time, padded) -> None:
 
 
 @loop
+def splat_moved(moved, time, padded) -> None:
+    """What changes in bins when light arrives later.
+
+    Args:
+        moved, time: ``[B, K]`` light times how much later it comes (bins), and when it came (bins).
+        padded: ``[B, T + ROW]``, added to.
+    """
+    bins = np.float32(padded.shape[1] - ROW)
+    for b in range(len(moved)):
+        row = padded[b]
+        for k in range(moved.shape[1]):
+            i, s = _place(time[b, k], bins)
+            v, left = moved[b, k] * HALF, ONE - s
+            row[i] -= v * left * left
+            row[i + 1] += v * s * (THREE * s - FOUR)
+            row[i + 2] += v * (ONE + s * (TWO - THREE * s))
+            row[i + 3] += v * s * s
+
+
+@loop
 def spline_values(padded, time, value, slope) -> None:
     """What arrivals see of bins through their shares, the transpose of :func:`splat`.
 

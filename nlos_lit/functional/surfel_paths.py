@@ -11,6 +11,7 @@ curved patch vary smoothly over it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -377,9 +378,7 @@ class SplineSplat(torch.autograd.Function):
     def forward(contribution: Tensor, time: Tensor, n_bins: int) -> Tensor:
         """``[B, n_bins]`` in the unit of ``contribution``."""
         if for_loops(time):
-            padded = contribution.new_zeros(len(time), n_bins + path_loops.ROW)
-            path_loops.splat(*map(numpy_of, (contribution, time, padded)))
-            return padded[:, EDGE : EDGE + n_bins].contiguous()
+            return _by_loop(path_loops.splat, contribution, time, n_bins)
         place, f = _located(time, n_bins)
         first = contribution * f
         second = first * f
@@ -389,6 +388,7 @@ class SplineSplat(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         """Keep contributions and times for both directions of differentiation."""
         contribution, time, ctx.n_bins = inputs
+        ctx.set_materialize_grads(False)
         ctx.save_for_backward(contribution, time)
         ctx.save_for_forward(contribution, time)
 
@@ -403,11 +403,33 @@ class SplineSplat(torch.autograd.Function):
     def jvp(ctx: Any, d_contribution: Tensor | None, d_time: Tensor | None, _: None) -> Tensor:
         """Change ``[B, T]`` of the transients with those of contributions and times."""
         contribution, time = ctx.saved_tensors
-        place, f = _located(time, ctx.n_bins)
-        moved = torch.zeros_like(f) if d_time is None else contribution * d_time
-        more = torch.zeros_like(f) if d_contribution is None else d_contribution
-        moments = [more, more * f + moved, (more * f + 2 * moved) * f, (more * f + 3 * moved) * f**2]
-        return _from_moments(moments, place, ctx.n_bins)
+        changes = [] if d_contribution is None else [SplineSplat.apply(d_contribution, time, ctx.n_bins)]
+        changes += [] if d_time is None else [_SplatMoved.apply(contribution * d_time, time, ctx.n_bins)]
+        return sum(changes[1:], changes[0])
+
+
+class _SplatMoved(torch.autograd.Function):
+    """Change ``[B, T]`` of transients where light arrives later, from ``[B, K]`` light times how much later
+    (bins), and when it came (bins).
+    """
+
+    @staticmethod
+    def forward(moved: Tensor, time: Tensor, n_bins: int) -> Tensor:
+        if for_loops(time):
+            return _by_loop(path_loops.splat_moved, moved, time, n_bins)
+        place, f = _located(time, n_bins)
+        return _from_moments([torch.zeros_like(f), moved, 2 * moved * f, 3 * moved * f**2], place, n_bins)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
+        """It is a derivative already, and is not derived."""
+
+
+def _by_loop(loop: Callable[..., None], light: Tensor, time: Tensor, n_bins: int) -> Tensor:
+    """``[B, n_bins]`` that a loop adds to from ``[B, K]`` light and times."""
+    padded = light.new_zeros(len(time), n_bins + path_loops.ROW)
+    loop(*map(numpy_of, (light, time, padded)))
+    return padded[:, EDGE : EDGE + n_bins].contiguous()
 
 
 def spline_at(image: Tensor, time: Tensor) -> tuple[Tensor, Tensor]:

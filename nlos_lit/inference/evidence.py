@@ -141,8 +141,8 @@ class Projector:
 
     def free(self, columns: Tensor) -> Tensor:
         """``[N + H, k]``: ``columns`` ``[N, k]`` without their projection on the nuisance."""
-        weights = torch.cholesky_solve((self.nuisance.T @ columns).double(), self.factor).float()
-        return torch.cat([columns - self.nuisance @ weights, -self.strength * weights[self.held]])
+        weights = torch.cholesky_solve((columns.T @ self.nuisance).T.double(), self.factor).float()
+        return _less(columns, self.nuisance, weights, self.strength * weights[self.held])
 
     def even(self, z: Tensor, width: int, across: Tensor | None = None) -> Tensor:
         """Without what patches do that look uneven.
@@ -158,7 +158,7 @@ class Projector:
         variance = self.variances[width]
         shrink = variance / (1 + variance * self.values)
         weights = (self.axes @ (shrink[:, None] * (self.along(z) if across is None else across))).float()
-        return torch.cat([z - self.uneven @ weights, -weights / variance.sqrt().float()])
+        return _less(z, self.uneven, weights, weights / variance.sqrt().float())
 
     def freed(self, columns: Tensor) -> Freed:
         """``columns`` ``[N, k]`` after both steps, at the width without any term.
@@ -202,7 +202,15 @@ class Projector:
 
     def along(self, z: Tensor) -> Tensor:
         """Scores ``[Q, k]`` of the uneven columns' eigenvectors, of ``[N + H, k]`` :meth:`free` columns."""
-        return self.axes.T @ (self.uneven.T @ z).double()
+        return self.axes.T @ (z.T @ self.uneven).T.double()
+
+
+def _less(columns: Tensor, x: Tensor, weights: Tensor, further: Tensor) -> Tensor:
+    """``[N + n, k]`` ``columns`` ``[N, k]`` less x @ weights, and 0 less ``further`` ``[n, k]``."""
+    found = columns.new_empty(len(columns) + len(further), columns.shape[1])
+    torch.addmm(columns, x, weights, alpha=-1, out=found[: len(columns)])
+    torch.neg(further, out=found[len(columns) :])
+    return found
 
 
 def half_products(x: Tensor, block: int = 512) -> Tensor:
@@ -291,14 +299,16 @@ def evidence(
     Returns:
         what the counts say of it.
     """
-    z, rows = z * deviation.float(), raw.shape[0] * raw.shape[1]
-    cells = block[:, None] * SEGMENTS + torch.arange(SEGMENTS)
-    last = SEGMENTS * (int(block.max()) + 1)
-    s = z.new_zeros(last, z.shape[1]).double()
-    f = s.new_zeros(last, z.shape[1], z.shape[1])
-    for k, (each, r) in enumerate(segments(z[:rows].view(raw.shape), residual[:rows].view(raw.shape[:2]))):
-        s.index_add_(0, cells[:, k], torch.einsum("stk,st->sk", each, r).double())
-        f.index_add_(0, cells[:, k], torch.einsum("stk,stl->skl", each, each).double())
+    rows, sizes = raw.shape[0] * raw.shape[1], block.bincount().tolist()
+    order, last = block.argsort(stable=True), SEGMENTS * len(sizes)
+    z = z * deviation.float()
+    s = z.new_empty(last, z.shape[1]).double()
+    f = s.new_empty(last, z.shape[1], z.shape[1])
+    bins = z[:rows].view(raw.shape)[order], residual[:rows].view(raw.shape[:2])[order]
+    for k, (each, r) in enumerate(segments(*bins)):
+        for b, cell in enumerate(zip(each.split(sizes), r.split(sizes), strict=True)):
+            own, left = cell[0].reshape(-1, z.shape[1]), cell[1].reshape(-1)
+            s[SEGMENTS * b + k], f[SEGMENTS * b + k] = own.T @ left, own.T @ own
     held = z[rows:].double()
     s = torch.cat([s, held * residual[rows:, None]])
     f = torch.cat([f, held[:, :, None] * held[:, None]])
@@ -324,7 +334,7 @@ def evidence(
     scatter = torch.maximum(left.square().sum(0), blocks.square().sum(0)).div(values).clamp_min(1.0)
     share = u.square() / values
     nats, variance, mean = best(scatter, bounds)
-    whole = (raw.double().square().sum((0, 1)) * deviation**2).clamp_min(1e-30)
+    whole = (raw.square().sum(1).double().sum(0) * deviation**2).clamp_min(1e-30)
     return Evidence(
         nats=nats,
         scale=variance**0.5,

@@ -609,7 +609,7 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
     Zᵀr⊥ is the score already; only the information needs the projection, whose passes over all of X are what
     costs. So shapes are ranked by the score over the unprojected information.
     """
-    shapes, ranked = _shapes(problem, projector, effect), []
+    shapes, kept = _shapes(problem, projector, effect), list[tuple[float, Shape, Tensor]]()
     for shape in shapes:
         effect.set_all(shape)
         z = weighted_columns(problem, effect)
@@ -618,13 +618,8 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
             score, information = (z.T @ projector.residual[: len(z)]).double(), (z.T @ z).double()
             floor = 1e-9 * information.diagonal().mean() + 1e-30
             worth = float(score @ torch.linalg.solve(information + floor * torch.eye(len(score)), score))
-        ranked.append((worth, shape, z if len(shapes) <= KEPT else None))
-    ranked.sort(key=lambda entry: -entry[0])
-    kept = []
-    for _, shape, known in ranked[:KEPT]:
-        effect.set_all(shape)
-        kept.append((shape, weighted_columns(problem, effect) if known is None else known))
-    return kept
+        kept = sorted([*kept, (worth, shape, z)], key=lambda entry: -entry[0])[:KEPT]
+    return [(shape, z) for _, shape, z in kept]
 
 
 def _shapes(problem: Problem, projector: Projector, effect: Effect) -> list[Shape]:

@@ -19,6 +19,7 @@ from nlos_lit.functional.surfel_graph import (
 )
 from nlos_lit.functional.surfel_paths import SplineSplat, Walls, patches, quadrature, spline_at, trace
 from nlos_lit.functional.surfel_visibility import who_hides
+from nlos_lit.inference.problem import pushed
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 GEN = torch.Generator().manual_seed(3)
@@ -111,6 +112,29 @@ def test_splines(plainly):
 
     assert alike(with_gradients(splatted, light, time), plainly(with_gradients, splatted, light, time))
     assert alike(list(spline_at(image, time)), list(plainly(spline_at, image, time)))
+
+
+def test_splines_in_forward_mode(plainly):
+    """By light, by times, or by both."""
+    time, light = 60 * torch.rand(3, 200, generator=GEN) - 5, torch.rand(3, 200, generator=GEN)
+    more, later = randn(3, 200), randn(3, 200)
+
+    def moved(by_light: Tensor | None, by_time: Tensor | None) -> list[Tensor]:
+        changes = {"light": by_light, "time": by_time}
+        at, given = {"light": light, "time": time}, [name for name, d in changes.items() if d is not None]
+
+        def splatted(*some: Tensor) -> Tensor:
+            now = at | dict(zip(given, some, strict=True))
+            return SplineSplat.apply(now["light"], now["time"], 50)
+
+        return list(pushed(splatted, tuple(at[n] for n in given), tuple(changes[n] for n in given)))
+
+    for change in ((more, None), (None, later), (more, later)):
+        found = moved(*change)
+        assert alike(found, plainly(moved, *change))
+        nudged = [x if d is None else x + 1e-3 * d for x, d in zip((light, time), change, strict=True)]
+        off = SplineSplat.apply(*nudged, 50) - found[0]
+        assert float((off / 1e-3 - found[1]).abs().max()) < 0.01 * float(found[1].abs().max())
 
 
 def test_what_is_no_number_is_lost():
