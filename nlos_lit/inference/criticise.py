@@ -275,15 +275,13 @@ class Loop:
         """
         found = [Held([], fine, base)]
         asked = [Member(t.candidate, t.rivals) for t in pool.together if not t.candidate.free]
-        imitated = [[Member(c) for c in pool.candidates if c.name in kind] for kind in IMITATED]
         known = any({m.name for m in asked} <= kind for kind in IMITATED)  # or nothing is asked for
-        for kind, members in enumerate([*imitated, asked]):
-            if not members or (members is asked and (known or len(found) == 1)):
-                continue
-            extension = copy_effects(Extension([]), [self._at_first(m.candidate, base) for m in members])
-            self.steps.plan(fit=1)
-            text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
-            fit = self.steps("fit", text, f"begun{kind}", partial(self._or_base, base, extension))
+        kinds = [[Member(c) for c in pool.candidates if c.name in kind] for kind in IMITATED]
+        built = self._built_at_first(base, {k: members for k, members in enumerate(kinds) if members})
+        for kind, members in enumerate([*kinds, asked]):
+            if members is asked and not known and len(found) > 1:
+                built |= self._built_at_first(base, {kind: asked})
+            fit = built.get(kind, base)
             if not fit.extension.effects or not self.predicts(fit, base, SURE):
                 continue
             names = [m.name for m in members]
@@ -295,6 +293,16 @@ class Loop:
                 found.append(Held(members, grown, fit))
         best = self.better(*(one.coarse for one in found))
         return next(one for one in found if one.coarse is best)
+
+    def _built_at_first(self, base: SurfelFit, kinds: dict[int, list[Member]]) -> dict[int, SurfelFit]:
+        """Scenes built with the terms of each kind, or the base where no surfel survives with them."""
+        jobs = []
+        for kind, members in kinds.items():
+            extension = copy_effects(Extension([]), [self._at_first(m.candidate, base) for m in members])
+            text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
+            jobs.append((text, f"begun{kind}", partial(self._or_base, base, extension)))
+        self.steps.plan(fit=len(jobs))
+        return dict(zip(kinds, self.steps.several("fit", jobs, self.settings.processes), strict=True))
 
     def _at_first(self, candidate: Candidate, base: SurfelFit) -> Effect:
         """What a scene is built with: the effect as it begins, with the shapes that the pool asks for."""
@@ -377,8 +385,12 @@ class Loop:
         Returns:
             another fit.
         """
+        return self.steps("fit", *self._refining(fit, name))
+
+    def _refining(self, fit: SurfelFit, name: str) -> tuple[str, str, Callable[[], SurfelFit]]:
+        """What :meth:`fine` says, keeps and does."""
         text, kept = f"refining the scene {name.replace('_', ' ')}", f"fine{self.number}_{name}"
-        return self.steps("fit", text, kept, lambda: solve_spots(self.grow(fit, self.seed)))
+        return text, kept, lambda: solve_spots(self.grow(fit, self.seed))
 
     def grown(self, coarse: SurfelFit, name: str) -> SurfelFit:
         """The scene as fine as the counts ask for, or the parsimonious one, whichever predicts better.
@@ -544,35 +556,54 @@ class Loop:
             The same members, and by name the scenes that were built without them: parsimonious, and fine
             where it was asked.
         """
-        names = [m.name for m in members]
-        value, found = log_likelihood(coarse, self.split.select), []
-        built = dict[str, Built]()
-        self.steps.plan(fit=sum(m.accepted for m in members))
-        for member in members:
-            if not member.accepted:
-                found.append(member)
-                continue
-            kept = f"anew{self.number}_{'_'.join(names)}_but_{member.name}"
-            make = partial(self._without_it, coarse, member.name)
-            fit = self.steps("fit", f"rebuilding the scene without {member.name}", kept, make)
-            gain, weight, explained = self._gained(fit, log_likelihood(fit, self.split.select), value)
-            old = member.confirmed
-            assert old is not None
-            least = gain if gain.nats < old.gain.nats else old.gain
-            now = replace(
-                old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
+        names, value = [m.name for m in members], log_likelihood(coarse, self.split.select)
+        kept, asked = f"anew{self.number}_{'_'.join(names)}_but_", [m for m in members if m.accepted]
+        self.steps.plan(fit=len(asked))
+        jobs = [
+            (
+                f"rebuilding the scene without {m.name}",
+                kept + m.name,
+                partial(self._without_it, coarse, m.name),
             )
-            free, per_spot = member.candidate.free, member.candidate.effect.per_spot
-            built[member.name] = fit, None
-            if now.holds(member.candidate) and not per_spot and not (free and now.much):
-                self.steps.plan(fit=1, screen=1)
-                fine = self.fine(fit, f"with_all_of_{'_'.join(names)}_but_{member.name}")
-                built[member.name] = fit, fine
-                if not self._accounts(now.evidence, scene, fine):
-                    evidence = self._beside(fine, member.name, kept)
-                    now = replace(now, evidence=min(evidence, now.evidence))
-            found.append(replace(member, confirmed=now, accepted=now.holds(member.candidate)))
+            for m in asked
+        ]
+        fits = self.steps.several("fit", jobs, self.settings.processes)
+        built: dict[str, Built] = {m.name: (fit, None) for m, fit in zip(asked, fits, strict=True)}
+        now = {m.name: self._missed(m, fit, value) for m, fit in zip(asked, fits, strict=True)}
+        finer = [
+            m.name
+            for m in asked
+            if now[m.name].holds(m.candidate)
+            and not m.candidate.effect.per_spot
+            and not (m.candidate.free and now[m.name].much)
+        ]
+        self.steps.plan(fit=len(finer), screen=len(finer))
+        refining = [self._refining(built[n][0], f"with_all_of_{'_'.join(names)}_but_{n}") for n in finer]
+        for name, fine in zip(
+            finer, self.steps.several("fit", refining, self.settings.processes), strict=True
+        ):
+            built[name] = built[name][0], fine
+            if not self._accounts(now[name].evidence, scene, fine):
+                evidence = self._beside(fine, name, kept + name)
+                now[name] = replace(now[name], evidence=min(evidence, now[name].evidence))
+        found = [
+            replace(m, confirmed=now[m.name], accepted=now[m.name].holds(m.candidate)) if m.name in now else m
+            for m in members
+        ]
         return found, built
+
+    def _missed(self, member: Member, fit: SurfelFit, value: Tensor) -> Confirmed:
+        """What a member is worth over a scene that went on without it, or was built so: the lesser.
+
+        ``value`` ``[S]`` nats is that of the parsimonious scene with it.
+        """
+        gain, weight, explained = self._gained(fit, log_likelihood(fit, self.split.select), value)
+        old = member.confirmed
+        assert old is not None
+        least = gain if gain.nats < old.gain.nats else old.gain
+        return replace(
+            old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
+        )
 
     def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
         """A term of a scene accounts for most of the misfit of a fine one without it.
