@@ -759,17 +759,7 @@ class Loop:
         scene = self._parted(scene, gone, f"bare{self.number}_{'_'.join(gone)}")
         if not came:
             return settled, scene
-        scene = self.gone_on(scene, [m.candidate for m in came])
-        own, _ = self._own(scene, [m.name for m in came], f"now{self.number}")
-        confirmed = dict[str, Member]()
-        for member in came:
-            none = next(t for t in member.trials if t.candidate is None)
-            gained = self._gained(none.fit, none.likelihood, member.trial.likelihood)
-            evidence, needed, shared = own[member.name]
-            confirmed[member.name] = replace(
-                member, confirmed=Confirmed(evidence, needed, *gained, shared, self.least)
-            )
-        return [confirmed.get(m.name, m) for m in settled], scene
+        return settled, self.gone_on(scene, [m.candidate for m in came])
 
     def only(self, fit: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """The same scene, gone on without all other terms.
@@ -812,7 +802,7 @@ class Loop:
             member: that holds.
 
         Returns:
-            The member, with the simplest of those that gain most as its term.
+            The member, with the simplest of those that gain most as its term; a rival must hold as well.
         """
         s = self.settings
         itself, none = member.trials
@@ -832,10 +822,24 @@ class Loop:
             value = log_likelihood(fit, self.split.select)
             trials.append(Trial(c, fit, value, compare(none.likelihood, value, self.block)))
         trials = weighed(trials, self.block)
-        best = chosen(trials, s.odds, self.least)
+        left, confirmed = trials, member.confirmed
+        while (best := chosen(left, s.odds, self.least)).name != member.name:
+            confirmed = self._in_its_place(best, none, member.name)
+            assert best.candidate is not None
+            if confirmed.holds(best.candidate):
+                break
+            left, confirmed = [t for t in left if t is not best], member.confirmed
         assert best.candidate is not None
         group = group_of(best, trials, self.block, s.open_share, self.least)
-        return replace(member, candidate=best.candidate, trials=trials, group=group)
+        return replace(member, candidate=best.candidate, confirmed=confirmed, trials=trials, group=group)
+
+    def _in_its_place(self, trial: Trial, none: Trial, name: str) -> Confirmed:
+        """What a rival is worth in the place of the term ``name``, over none there."""
+        names = [e.name for e in trial.fit.extension.effects]
+        own, _ = self._own(trial.fit, names, f"rival{self.number}_{name}_{trial.name}")
+        evidence, needed, shared = own[trial.name]
+        gained = self._gained(none.fit, none.likelihood, trial.likelihood)
+        return Confirmed(evidence, needed, *gained, shared, self.least)
 
     def _misfit(self, fit: SurfelFit) -> float:
         """In the mean of fitted and select spots, for as many as the pool is asked on.

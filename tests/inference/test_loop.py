@@ -1021,3 +1021,18 @@ def test_a_simpler_rival_takes_the_place_of_a_term(monkeypatch):
     assert (member.trial.name, member.trial.gain.nats) == ("vignetting", pytest.approx(49.0))
     assert (member.confirmed.evidence, member.confirmed.gain) == (77.0, member.trial.gain), "its own"
     assert list(member.group) == ["vignetting", "wall_reflectance"]
+
+
+@pytest.mark.parametrize(("own", "named"), [(LEAST + 0.1, "vignetting"), (LEAST - 0.1, "wall_reflectance")])
+def test_a_rival_must_hold_where_it_takes_the_place(monkeypatch, own, named):
+    """By its own evidence, too; else the term stays, with what it was found to have, and the rival is left
+    open.
+    """
+    table = {"wall_reflectance": nats(50.0), "vignetting": nats(49.0)}
+    rivals = {"wall_reflectance": ["vignetting"]}
+    world = World(monkeypatch, table, [candidate("wall_reflectance")], {"vignetting": own}, rivals=rivals)
+    found = world.criticise()
+    (member,) = found.accepted
+    assert (member.name, found.final.names) == (named, {named})
+    assert member.confirmed.evidence == (own if named == "vignetting" else 100.0)
+    assert member.group.keys() == {"wall_reflectance", "vignetting"}
