@@ -278,8 +278,11 @@ def report() -> None:
     page.write_text(head + MARK + "\n\n" + "\n".join(parts))
 
 
-def holding(row: dict, share: float, level: float, even: float) -> set[str]:
-    """Effects that would have what they need when they were last asked for, by other constants."""
+def holding(row: dict, share: float, level: float, even: float, form: float) -> set[str]:
+    """Effects that would have what they need when they were last asked for, by other constants.
+
+    Older rows do not say how much of it is for what other terms take: that goes with the share.
+    """
     from nlos_lit.effects import EFFECTS
     from nlos_lit.effects.free_terms import FREE
     from nlos_lit.inference.criticise import CriticismSettings
@@ -287,11 +290,13 @@ def holding(row: dict, share: float, level: float, even: float) -> set[str]:
     now, terms = CriticismSettings(), len(EFFECTS) + len(FREE)
     least, changed = math.log(terms / now.level), math.log(terms / level)
     names = {e.name for e in EFFECTS}
-    return {
-        name
-        for name, (own, needed, _, _, weight, *_) in row["tried"].items()
-        if name in names and own > changed + (needed - least) * share / now.share and weight > even
-    }
+    found = set()
+    for name, (own, needed, _, _, weight, _, _, *others) in row["tried"].items():
+        shared = sum(others)
+        needs = changed + (needed - least - shared) * share / now.share + shared * form / now.form
+        if name in names and own > needs and weight > even:
+            found.add(name)
+    return found
 
 
 def sensitivity(set_name: str, commit_of: str) -> None:
@@ -306,20 +311,25 @@ def sensitivity(set_name: str, commit_of: str) -> None:
     every = [json.loads(text) for text in ROWS.read_text().splitlines()]
     rows = [r for r in every if (r["set_name"], r["commit"]) == (set_name, commit_of) and "tried" in r]
     now = CriticismSettings()
-    trials = [("share", s, (s, now.level, EVEN)) for s in (0.0, 0.02, 0.05, now.share, 0.2, 0.4)]
-    trials += [("level", v, (now.share, v, EVEN)) for v in (0.1, now.level, 0.001)]
-    trials += [("even", v, (now.share, now.level, v)) for v in (0.0, 0.2, EVEN, 0.8, 0.95)]
+    known = {"share": now.share, "level": now.level, "even": EVEN, "form": now.form}
+    others = {
+        "share": (0.0, 0.02, 0.05, now.share, 0.2, 0.4),
+        "level": (0.1, now.level, 0.001),
+        "even": (0.0, 0.2, EVEN, 0.8, 0.95),
+        "form": (0.0, 0.05, 0.1, now.form, 0.5),
+    }
     print(f"{len(rows)} captures\n")
     print(
         "| constant | value | right terms | wrong ones | captures with a wrong one |\n|---|---|---|---|---|"
     )
-    for name, value, constants in trials:
-        right = wrong = captures = 0
-        for row in rows:
-            true, held = true_names(row), holding(row, *constants)
-            right, wrong = right + len(held & true), wrong + len(held - true)
-            captures += bool(held - true)
-        print(f"| `{name}` | {value:g} | {right} | {wrong} | {captures} |")
+    for name, values in others.items():
+        for value in values:
+            right = wrong = captures = 0
+            for row in rows:
+                true, held = true_names(row), holding(row, **known | {name: value})
+                right, wrong = right + len(held & true), wrong + len(held - true)
+                captures += bool(held - true)
+            print(f"| `{name}` | {value:g} | {right} | {wrong} | {captures} |")
 
 
 def main(arguments: list[str]) -> None:

@@ -35,7 +35,8 @@ class Outcome:
         largest: term and nats of the most evidence in the first pool.
         likely: terms that are told of and not named.
         tried: of each term what was found when it was last asked for: own and needed nats, gain of the select
-            spots and its error, weight, explained share, and whether it was accepted.
+            spots and its error, weight, explained share, whether it was accepted, and the nats of those
+            needed that are for what other terms take from it.
         error: what went wrong.
     """
 
@@ -100,7 +101,16 @@ def said(diagnosis: Diagnosis, found: Findings) -> dict:
         "largest": (diagnosis.screened[0].name, diagnosis.screened[0].evidence),
         "likely": [term.name for term in diagnosis.likely],
         "tried": {
-            name: [c.evidence, c.needed, c.gain.nats, c.gain.error, c.weight, c.explained, float(accepted)]
+            name: [
+                c.evidence,
+                c.needed,
+                c.gain.nats,
+                c.gain.error,
+                c.weight,
+                c.explained,
+                float(accepted),
+                c.shared,
+            ]
             for name, (c, accepted) in asked.items()
         },
     }
