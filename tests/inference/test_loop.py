@@ -1006,6 +1006,24 @@ def test_a_rival_that_holds_beside_a_term_does_not_take_its_place(monkeypatch):
     assert {t.name for t in found.accepted[0].trials} == {"wall_reflectance", "none"}
 
 
+def test_side_by_side_all_is_found_as_one_after_the_other(monkeypatch):
+    """Scenes that are begun, and those without each of two terms that hold."""
+    pool = [candidate("irf_tail", 50.0), candidate("hum", 40.0), candidate("pile_up", 0.0)]
+    table = {"irf_tail": nats(50.0), "hum": nats(30.0), "fine": nats(5.0)}
+
+    def found(processes: int) -> tuple[list[str], list[list[str]], list[tuple[str, float]]]:
+        world = World(monkeypatch, table, pool, imitated=(("irf_tail",), ("hum", "pile_up")))
+        what = world.criticise(CriticismSettings(processes=processes))
+        gains = [(m.name, m.confirmed.gain.nats) for m in what.members if m.confirmed]
+        return names_of(what.accepted), sorted(map(sorted, world.grown)), gains
+
+    one = found(1)
+    assert found(2) == one
+    assert set(one[0]) == {"irf_tail", "hum"}
+    for left in ("hum", "irf_tail"):
+        assert [left] in one[1], "the other was left out, and what is left became fine"
+
+
 def test_a_simpler_rival_takes_the_place_of_a_term(monkeypatch):
     """Where it gains as much; the others stay as they are."""
     table = {"wall_reflectance": nats(50.0), "vignetting": nats(49.0), "irf_tail": nats(60.0)}
