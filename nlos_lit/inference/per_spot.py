@@ -27,7 +27,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.problem import effect_columns
+from nlos_lit.inference.problem import expected_and_columns, path_batch
 from nlos_lit.surfels.model import SurfelModel
 
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
@@ -174,8 +174,14 @@ def coefficients(score: Tensor, information: Tensor, width: float, positive: boo
     return width**2 * score / (1 + width**2 * information)
 
 
+@torch.no_grad()
 def spot_scores(
-    model: SurfelModel, extension: Extension, effect: Effect, spots: Tensor, counts: Tensor
+    model: SurfelModel,
+    extension: Extension,
+    effect: Effect,
+    spots: Tensor,
+    counts: Tensor,
+    transients: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Score and information of each spot's own coefficient at its present value.
 
@@ -185,13 +191,13 @@ def spot_scores(
         effect: a per-spot effect, of the extension or beside it.
         spots: ``[S]`` rows of the capture.
         counts: ``[S, T]`` of them.
+        transients: ``[S, T]`` light that arrives, where it is known already.
 
     Returns:
         score ``[S]``, information ``[S]``, and expected counts ``[S, T]``.
     """
-    with torch.no_grad():
-        expected = model.expected(spots, extension).double().clamp_min(1e-6)
-    column = effect_columns(model, extension, spots, effect).view(expected.shape).double()
+    found, columns = expected_and_columns(model, extension, spots, effect, transients=transients)
+    expected, column = found.double().clamp_min(1e-6), columns.view(found.shape).double()
     return (column * (counts / expected - 1)).sum(1), (column**2 / expected).sum(1).clamp_min(1e-30), expected
 
 
@@ -213,9 +219,11 @@ def solve(
     """
     p = effect.amplitudes[0]
     raw = getattr(effect, f"raw_{p.name}")
-    near = None if effect.in_runs else neighbours(model, spots)
+    near, light = None if effect.in_runs else neighbours(model, spots), None
+    if not effect.needs_paths:  # what it cannot change
+        light = torch.cat([model.arrived(part, extension) for part in spots.split(path_batch(model))])
     for _ in range(rounds):
-        score, information, _ = spot_scores(model, extension, effect, spots, counts)
+        score, information, _ = spot_scores(model, extension, effect, spots, counts, light)
         own = raw[spots].double()
         score = score + information * own  # that a start at 0 would have had
         if near is not None:

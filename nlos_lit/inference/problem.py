@@ -130,12 +130,12 @@ def build_problem(
             light.append(model.arrived(part, extension))
         surfels.append(_surfel_columns(model, extension, part, light[-1], towards[part], patch, coarse))
         forward = _recording(model, extension, part, light[-1])
-        both = [_jvp(forward, name, p, torch.ones_like(p))[:, first:] for name, p in response.items()]
+        both = [_jvp(forward, name, p, torch.ones_like(p))[1][:, first:] for name, p in response.items()]
         whole = _Forward(model, extension, partial(_render, part))
         does = {"roll": bool(model.outward.any()), "raw_opacity": len(model.hiders) > 0}
         for name in (n for n, some in does.items() if some):
             p = getattr(model, name).detach()
-            both.append(_jvp(whole, f"model.{name}", p, torch.ones_like(p)))
+            both.append(_jvp(whole, f"model.{name}", p, torch.ones_like(p))[1])
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]
@@ -182,23 +182,37 @@ def effect_columns(
     Returns:
         ``[S·bins, k]``; a per-spot effect gives one column: every spot's own.
     """
+    return expected_and_columns(model, extension, spots, effect, shapes, transients)[1]
+
+
+def expected_and_columns(
+    model: SurfelModel,
+    extension: Extension,
+    spots: Tensor,
+    effect: Effect,
+    shapes: bool = False,
+    transients: Tensor | None = None,
+) -> tuple[Tensor, Tensor]:
+    """Expected counts ``[S, bins]`` with an effect at its present values, and :func:`effect_columns`, which
+    are worked out together.
+    """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
     factors = effect.factors(spots)
     if factors is not None:
         one = effect.alone()
-        alike = effect_columns(model, whole, spots, one, transients=transients)
+        expected, alike = expected_and_columns(model, whole, spots, one, transients=transients)
         unit = effect.amplitudes[0].scale / one.amplitudes[0].scale
         by_spot = alike.view(len(spots), -1, 1, alike.shape[1])
-        return (by_spot * (unit * factors)[:, None, :, None]).flatten(2).flatten(0, 1)
+        return expected, (by_spot * (unit * factors)[:, None, :, None]).flatten(2).flatten(0, 1)
     index = list(whole.effects).index(effect)
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
     names = [
         (f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted
     ]
-    parts = []
+    parts, values = [], []
     by_paths = effect.needs_paths or transients is None
-    size = _path_batch(model) if by_paths else max(1, BATCH // model.n_bins)
+    size = path_batch(model) if by_paths else max(1, BATCH // model.n_bins)
     for start in range(0, len(spots), size):
         part = spots[start : start + size]
         forward = _staged(
@@ -209,9 +223,11 @@ def effect_columns(
             for k in range(1 if effect.per_spot else number):
                 tangent = torch.ones_like(raw) if effect.per_spot else torch.zeros_like(raw)
                 tangent[k] = 1.0
-                columns.append(_jvp(forward, name, raw, tangent))
+                value, column = _jvp(forward, name, raw, tangent)
+                columns.append(column)
+        values.append(value[:, first:])
         parts.append(torch.stack(columns, -1)[:, first:].flatten(0, 1))
-    return torch.cat(parts)
+    return torch.cat(values), torch.cat(parts)
 
 
 def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
@@ -251,11 +267,14 @@ class _Forward(nn.Module):
 
 
 @torch.no_grad()
-def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> Tensor:
+def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
+    """What comes out, and its change with one parameter."""
+
     def at(v: Tensor) -> Tensor:
         return torch.func.functional_call(forward, {name: v}, ())
 
-    return pushed(at, (value.detach(),), (tangent,))[1]
+    found: tuple[Tensor, Tensor] = pushed(at, (value.detach(),), (tangent,))
+    return found
 
 
 @torch.no_grad()
@@ -426,5 +445,6 @@ def albedo_unit(albedo: Tensor) -> Tensor:
     return torch.maximum(albedo, 0.05 * albedo.mean())
 
 
-def _path_batch(model: SurfelModel) -> int:
+def path_batch(model: SurfelModel) -> int:
+    """Spots of about two million paths."""
     return max(1, (1 << 21) // max(1, len(model) * model.quadrature**2))
