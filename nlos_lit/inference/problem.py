@@ -12,7 +12,7 @@ variance.
 - ``Z [N, K]``: effects at their null, :func:`effect_columns`.
 
 All derivatives are exact (forward mode); the response, gain and counting stages enter through the Jacobian of
-:meth:`SurfelModel.record`, one ``[T, T]`` matrix a spot.
+:meth:`SurfelModel.record`, one ``[T, T]`` matrix a spot where counts of a bin depend on the light of others.
 """
 
 from __future__ import annotations
@@ -309,6 +309,7 @@ def _recording(model: SurfelModel, extension: Extension, spots: Tensor, transien
     return _Forward(model, extension, lambda m, e: m.record(transients, spots, e))
 
 
+@torch.no_grad()
 def _surfel_columns(
     model: SurfelModel,
     extension: Extension,
@@ -319,23 +320,37 @@ def _surfel_columns(
     coarse: Tensor,
 ) -> Tensor:
     """``[B·T_gate, P]`` derivatives of the expected counts by all that the scene may do."""
-    jacobian = _record_jacobian(model, extension, spots, transients)
-    return torch.bmm(jacobian, _transient_columns(model, extension, spots, towards, patch, coarse)).flatten(
-        0, 1
-    )
+    first, columns = model.gate[0], _transient_columns(model, extension, spots, towards, patch, coarse)
+    unit = model.signal(torch.eye(transients.shape[1]), extension)
+    signal = model.signal(transients, extension)
+    if (alone := _by_bin(lambda x: model.detect(x, spots, extension), signal)) is not None:
+        return ((unit.T[first:] @ columns) * alone[:, first:, None]).flatten(0, 1)
+    return torch.bmm(_record_jacobian(model, extension, spots, signal, unit), columns).flatten(0, 1)
 
 
 @torch.no_grad()
-def _record_jacobian(model: SurfelModel, extension: Extension, spots: Tensor, transients: Tensor) -> Tensor:
+def _by_bin(function: Callable[[Tensor], Tensor], at: Tensor) -> Tensor | None:
+    """Derivatives ``[B, T]`` of what comes out in each bin by what goes in there; None where other bins see
+    it, too, which a random change of all of them tells.
+    """
+    tried = torch.rand(at.shape, generator=torch.Generator().manual_seed(0)) - 0.5
+    alone = pushed(function, (at,), (torch.ones_like(at),))[1]
+    off = pushed(function, (at,), (tried,))[1] - alone * tried
+    return alone if bool((off.abs() <= 1e-5 * alone.abs().max()).all()) else None
+
+
+@torch.no_grad()
+def _record_jacobian(
+    model: SurfelModel, extension: Extension, spots: Tensor, signal: Tensor, unit: Tensor
+) -> Tensor:
     """``[B, T_gate, T]`` ∂(expected counts)/∂(transients), for any gain and counting stage.
 
-    The response is the same at all spots and linear: it is worked out once.
+    The response is the same at all spots and linear: ``unit`` ``[T, T]`` is what each bin's light becomes.
     """
-    b, t = transients.shape
-    signal = model.signal(transients, extension).repeat_interleave(t, 0)
-    unit = model.signal(torch.eye(t), extension).repeat(b, 1)
+    b, t = signal.shape
     again = spots.repeat_interleave(t)
-    rows = pushed(lambda x: model.detect(x, again, extension), (signal,), (unit,))[1]
+    given = (signal.repeat_interleave(t, 0),), (unit.repeat(b, 1),)
+    rows = pushed(lambda x: model.detect(x, again, extension), *given)[1]
     return rows.view(b, t, t)[:, :, model.gate[0] :].transpose(1, 2)
 
 

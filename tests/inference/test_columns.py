@@ -26,6 +26,7 @@ from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference.criticise import copy_effects
 from nlos_lit.inference.evidence import Projector
 from nlos_lit.inference.problem import (
+    _by_bin,
     acting_order,
     build_problem,
     effect_columns,
@@ -306,3 +307,17 @@ def test_effects_act_in_the_order_of_the_registry_whenever_they_were_accepted():
     assert [acting_order(e(scan)) for e in EFFECTS] == list(range(len(EFFECTS)))
     stages = [e.stage for e in EFFECTS]
     assert sorted(stages, key=["path", "time", "response", "spot", "counting"].index) == stages
+
+
+@pytest.mark.parametrize(("seen", "alone"), [(0.0, True), (1e-3, False)])
+def test_bins_that_others_see_are_told(seen, alone):
+    """A thousandth of the light of the bin before is enough; the square of a bin's own light is not."""
+    signal = torch.rand(4, 30, generator=torch.Generator().manual_seed(2)) + 0.5
+
+    def counted(light: Tensor) -> Tensor:
+        return 3 * light**2 + seen * light.roll(1, 1)
+
+    found = _by_bin(counted, signal)
+    assert (found is not None) is alone
+    if found is not None:
+        torch.testing.assert_close(found, 6 * signal)
