@@ -5,7 +5,8 @@ axes, each with the same prior deviation, or, along the scan, with the same for 
 stands in the same contest as the effects of the registry, can be fitted, shown and measured like them, and
 says where to look when no equation fits.
 
-    f = Σ_k c_k b_k,    counts → counts · e^f   or   background → background · e^f   or   L → L + f
+    f = Σ_k c_k b_k,    counts → counts · e^f,    light → light · e^f,    background → background · e^f
+                 or     L → L + f
 """
 
 from __future__ import annotations
@@ -154,16 +155,26 @@ class FreeWall(_FreeCounts):
         return over_wall(scan, 8)[0]
 
 
-class FreeLines(_FreeCounts):
-    """``m → m e^{f(x) + g(y)}``, f and g constant within each of 24 stripes of the wall."""
+class FreeLines(FreeTerm):
+    """``signal → signal e^{f(x) + g(y)}``, f and g constant within each of 24 stripes of the wall.
+
+    No effect changes the scene's light so. On counts it would change the background with it, and an effect of
+    the background would be asked for to put that right.
+    """
 
     name, axis = "free_lines", "wall"
-    words = _words("along rows or columns of the wall", "Whole rows or columns count too much or too little.")
+    words = _words(
+        "along rows or columns of the wall",
+        "Whole rows or columns get too much of the scene's light, or too little.",
+    )
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
         place = scan.places[-1]
         return torch.cat([bands((place[:, k] + 1) / 2, 24) for k in (0, 1)], 1)
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        return signal * torch.exp(self.at(spots))
 
 
 class FreeScan(_AlongScan, _FreeCounts):

@@ -67,7 +67,7 @@ def test_bands_by_hand():
     assert time[GATE[0] :].argmax(1).tolist() == [k * 40 // 58 for k in range(58)]
 
 
-@pytest.mark.parametrize("name", ["free_wall", "free_lines", "free_scan", "free_rate", "free_time"])
+@pytest.mark.parametrize("name", ["free_wall", "free_scan", "free_rate", "free_time"])
 def test_factors_of_counts_by_hand(name):
     """Coefficient 3 multiplies counts by e to the 0.1 times its function, for light and background alike."""
     effect, expected = with_one(name, 3, 0.1), 1 + torch.rand(256, 64)
@@ -81,16 +81,22 @@ def test_factors_of_counts_by_hand(name):
     elif name == "free_time":
         function = effect.functions[:, 3]
         assert function.nonzero()[:, 0].tolist() == [GATE[0] + 5]  # 58/40 bins a band: 4.35 … 5.8
-    elif name == "free_lines":
-        function = (SCAN.laser[:, 0] - SCAN.laser[:, 0].min()) / 0.8 * 24
-        function = function.long().eq(3).float()[:, None]
-        assert function.sum() == SIDE
     else:
         function = effect.functions[:, 3:4]
         assert effect.functions.square().mean(0).tolist() == pytest.approx([1.0] * 63, rel=1e-4)
         assert effect.functions.mean(0).abs().max() < 1e-4
     found = effect.counting(expected, SPOTS)
     assert torch.allclose(found, expected * torch.exp(0.1 * function), rtol=1e-5)
+
+
+def test_factors_of_lines_by_hand():
+    """Coefficient 3 multiplies the scene's light in the fourth of 24 stripes; the background stays."""
+    effect, signal = with_one("free_lines", 3, 0.1), 1 + torch.rand(256, 64)
+    stripe = (SCAN.laser[:, 0] - SCAN.laser[:, 0].min()) / 0.8 * 24
+    dark = stripe.long().eq(3).float()[:, None]
+    assert dark.sum() == SIDE
+    assert torch.allclose(effect.gain(signal, SPOTS), signal * torch.exp(0.1 * dark), rtol=1e-5)
+    assert effect.hooks == {"gain"}
 
 
 @pytest.mark.parametrize("name", ["free_scan_background", "free_wall_background"])
