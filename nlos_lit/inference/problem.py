@@ -9,7 +9,7 @@ variance.
   front, how far rims roll off, and the parameters of effects that were accepted before.
 - ``U [N, Q]``: how bright each patch is from where on the wall, all alike unknown by a deviation of its own.
 - ``r [N]``: residual (counts - μ)/√μ.
-- ``Z [N, K]``: effects at their null, :func:`effect_columns`.
+- ``Z [N, K]``: effects at their null, :func:`expected_and_columns`.
 
 All derivatives are exact (forward mode); the response, gain and counting stages enter through the Jacobian of
 :meth:`SurfelModel.record`, one ``[T, T]`` matrix a spot where counts of a bin depend on the light of others.
@@ -139,7 +139,10 @@ def build_problem(
         others.append(torch.stack(both, -1).flatten(0, 1))
     transients = torch.cat(light)
     accepted = [e for e in extension.effects if with_effects and not e.per_spot and e is not without]
-    more = [effect_columns(model, extension, spots, e, shapes=True, transients=transients) for e in accepted]
+    more = [
+        expected_and_columns(model, extension, spots, e, shapes=True, transients=transients)[1]
+        for e in accepted
+    ]
     weight = expected.reshape(-1, 1).rsqrt()
     number = 2 * (int(patch.max()) + 1) + 2 * (int(coarse.max()) + 1)
     nuisance = torch.cat([torch.cat([s[:, :number] for s in surfels]), torch.cat(others), *more], 1)
@@ -161,15 +164,15 @@ def _lit(model: SurfelModel, extension: Extension, spots: Tensor, transients: Te
     return (light / (light + background).clamp_min(1e-9))[:, model.gate[0] :].clamp(0.0, 1.0).reshape(-1)
 
 
-def effect_columns(
+def expected_and_columns(
     model: SurfelModel,
     extension: Extension,
     spots: Tensor,
     effect: Effect,
     shapes: bool = False,
     transients: Tensor | None = None,
-) -> Tensor:
-    """∂μ/∂(stored values) of an effect at its present values, beside those of the extension.
+) -> tuple[Tensor, Tensor]:
+    """μ, and ∂μ/∂(stored values) of an effect at its present values, beside those of the extension.
 
     Args:
         model: of the counts.
@@ -180,21 +183,8 @@ def effect_columns(
         transients: ``[S, T]`` of these spots, where they are known already.
 
     Returns:
-        ``[S·bins, k]``; a per-spot effect gives one column: every spot's own.
-    """
-    return expected_and_columns(model, extension, spots, effect, shapes, transients)[1]
-
-
-def expected_and_columns(
-    model: SurfelModel,
-    extension: Extension,
-    spots: Tensor,
-    effect: Effect,
-    shapes: bool = False,
-    transients: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
-    """Expected counts ``[S, bins]`` with an effect at its present values, and :func:`effect_columns`, which
-    are worked out together.
+        ``[S, bins]`` expected counts with the effect, and ``[S·bins, k]`` columns; a per-spot effect gives
+        one column: every spot's own.
     """
     first, present = model.gate[0], list(extension.effects)
     whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
@@ -231,7 +221,7 @@ def expected_and_columns(
 
 
 def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:
-    """:func:`effect_columns` of a problem's spots, divided by √μ.
+    """:func:`expected_and_columns` of a problem's spots, divided by √μ.
 
     Args:
         problem: of the spots.
@@ -241,10 +231,8 @@ def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> 
     Returns:
         ``[S·bins, k]``.
     """
-    columns = effect_columns(
-        problem.model, problem.extension, problem.spots, effect, shapes, problem.transients
-    )
-    return columns * problem.expected.reshape(-1, 1).rsqrt()
+    given = (problem.model, problem.extension, problem.spots, effect, shapes, problem.transients)
+    return expected_and_columns(*given)[1] * problem.expected.reshape(-1, 1).rsqrt()
 
 
 def acting_order(effect: Effect) -> int:

@@ -29,7 +29,7 @@ from nlos_lit.inference.problem import (
     _by_bin,
     acting_order,
     build_problem,
-    effect_columns,
+    expected_and_columns,
     patches_of,
     towards_wall,
     weighted_columns,
@@ -166,7 +166,7 @@ def test_batches_of_spots_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize("name", [e.name for e in [*EFFECTS, *FREE]])
-def test_effect_columns_are_the_slope_of_the_render(name):
+def test_columns_of_effects_are_the_slope_of_the_render(name):
     """At values away from the null, beside two effects that were accepted before; amplitudes first, then
     shapes.
     """
@@ -176,7 +176,7 @@ def test_effect_columns_are_the_slope_of_the_render(name):
     uneven(effect)
     whole = copy_effects(extension, [effect])
     place = [e.name for e in whole.effects].index(name)
-    ours = effect_columns(model, extension, spots, effect, shapes=True)
+    ours = expected_and_columns(model, extension, spots, effect, shapes=True)[1]
     wanted = [
         (p.name, k)
         for p in (*effect.amplitudes, *effect.shapes)
@@ -196,7 +196,7 @@ def test_effect_columns_are_the_slope_of_the_render(name):
         tolerance = (1e-3 if rounded else 5e-5) * largest
         assert float((ours[:, column] - numeric).abs().max()) <= tolerance, parameter
     assert bool((ours != 0).any())
-    amplitudes = effect_columns(model, extension, spots, effect)
+    amplitudes = expected_and_columns(model, extension, spots, effect)[1]
     assert torch.equal(amplitudes, ours[:, : amplitudes.shape[1]])
     assert amplitudes.shape[1] == sum(1 if effect.per_spot else p.size for p in effect.amplitudes)
 
@@ -211,10 +211,10 @@ def test_columns_of_what_acts_alike_at_all_spots_are_worked_out_once(name, kind,
     for effect in (effect_of(name, scan).double(), uneven(effect_of(name, scan)).double())[
         : 1 + (name in DELAYS)
     ]:
-        ours = effect_columns(model, extension, spots, effect)
+        ours = expected_and_columns(model, extension, spots, effect)[1]
         with monkeypatch.context() as patch:
             patch.setattr(type(effect), "factors", lambda self, spots: None)
-            exact = effect_columns(model, extension, spots, effect)
+            exact = expected_and_columns(model, extension, spots, effect)[1]
         assert float(exact.abs().max()) > 0
         assert float((ours - exact).abs().max()) < 1e-6 * float(exact.abs().max())
 
@@ -291,7 +291,7 @@ def test_columns_of_an_accepted_effect_count_it_once():
     vignetting = extension.effects[0]
     problem = build_problem(model, extension, spots, torch.zeros(4, 58))
     numeric = slope(model, extension, spots, lambda mo, ex, h: ex.effects[0].raw_strength.add_(h), FINE)
-    ours = effect_columns(model, extension, spots, vignetting)[:, 0]
+    ours = expected_and_columns(model, extension, spots, vignetting)[1][:, 0]
     assert float((ours - numeric).abs().max()) < 1e-6 * float(numeric.abs().max())
     weighted = weighted_columns(problem, vignetting)[:, 0]
     assert torch.allclose(weighted, ours / problem.expected.reshape(-1).sqrt())
