@@ -299,16 +299,14 @@ def evidence(
     Returns:
         what the counts say of it.
     """
-    rows, sizes = raw.shape[0] * raw.shape[1], block.bincount().tolist()
-    order, last = block.argsort(stable=True), SEGMENTS * len(sizes)
-    z = z * deviation.float()
-    s = z.new_empty(last, z.shape[1]).double()
-    f = s.new_empty(last, z.shape[1], z.shape[1])
-    bins = z[:rows].view(raw.shape)[order], residual[:rows].view(raw.shape[:2])[order]
-    for k, (each, r) in enumerate(segments(*bins)):
-        for b, cell in enumerate(zip(each.split(sizes), r.split(sizes), strict=True)):
-            own, left = cell[0].reshape(-1, z.shape[1]), cell[1].reshape(-1)
-            s[SEGMENTS * b + k], f[SEGMENTS * b + k] = own.T @ left, own.T @ own
+    z, rows = z * deviation.float(), raw.shape[0] * raw.shape[1]
+    cells = block[:, None] * SEGMENTS + torch.arange(SEGMENTS)
+    last = SEGMENTS * (int(block.max()) + 1)
+    s = z.new_zeros(last, z.shape[1]).double()
+    f = s.new_zeros(last, z.shape[1], z.shape[1])
+    for k, (each, r) in enumerate(segments(z[:rows].view(raw.shape), residual[:rows].view(raw.shape[:2]))):
+        s.index_add_(0, cells[:, k], torch.einsum("stk,st->sk", each, r).double())
+        f.index_add_(0, cells[:, k], torch.einsum("stk,stl->skl", each, each).double())
     held = z[rows:].double()
     s = torch.cat([s, held * residual[rows:, None]])
     f = torch.cat([f, held[:, :, None] * held[:, None]])
