@@ -149,7 +149,9 @@ class _Convolution(torch.autograd.Function):
         ctx.save_for_forward(transients, kernel)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, grad: Tensor | None) -> tuple[Tensor | None, Tensor | None, None]:
+        if grad is None:
+            return None, None, None
         transients, kernel = ctx.saved_tensors
         bins, size = transients.shape[1], _whole(transients, kernel)
         pull = torch.fft.rfft(torch.nn.functional.pad(grad, (ctx.lead, 0)), size)

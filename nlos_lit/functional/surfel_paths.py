@@ -393,8 +393,10 @@ class SplineSplat(torch.autograd.Function):
         ctx.save_for_forward(contribution, time)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, None]:
+    def backward(ctx: Any, grad: Tensor | None) -> tuple[Tensor | None, Tensor | None, None]:
         """Gradients ``[B, K]`` of contributions and times from ``[B, T]`` of the transients."""
+        if grad is None:
+            return None, None, None
         contribution, time = ctx.saved_tensors
         value, slope = spline_at(grad, time)
         return value, contribution * slope, None

@@ -114,6 +114,17 @@ def test_splines(plainly):
     assert alike(list(spline_at(image, time)), list(plainly(spline_at, image, time)))
 
 
+def test_derivatives_of_splines_are_exact():
+    """In both directions, and where nothing is asked of what comes out."""
+    time, light = 8 * torch.rand(2, 5, generator=GEN).double(), torch.rand(2, 5, generator=GEN).double()
+    given = (light.requires_grad_(), time.requires_grad_())
+
+    def splatted(light: Tensor, time: Tensor) -> Tensor:
+        return SplineSplat.apply(light, time, 9)
+
+    assert torch.autograd.gradcheck(splatted, given, check_forward_ad=True)
+
+
 def test_splines_in_forward_mode(plainly):
     """By light, by times, or by both."""
     time, light = 60 * torch.rand(3, 200, generator=GEN) - 5, torch.rand(3, 200, generator=GEN)
