@@ -27,7 +27,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.problem import expected_and_columns, path_batch
+from nlos_lit.inference.problem import expected_and_columns
 from nlos_lit.surfels.model import SurfelModel
 
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
@@ -221,7 +221,7 @@ def solve(
     raw = getattr(effect, f"raw_{p.name}")
     near, light = None if effect.in_runs else neighbours(model, spots), None
     if not effect.needs_paths:  # what it cannot change
-        light = torch.cat([model.arrived(part, extension) for part in spots.split(path_batch(model))])
+        light = torch.cat([model.arrived(part, extension) for part in spots.split(model.batch)])
     for _ in range(rounds):
         score, information, _ = spot_scores(model, extension, effect, spots, counts, light)
         own = raw[spots].double()

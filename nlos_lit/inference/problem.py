@@ -202,7 +202,7 @@ def expected_and_columns(
     ]
     parts, values = [], []
     by_paths = effect.needs_paths or transients is None
-    size = path_batch(model) if by_paths else max(1, BATCH // model.n_bins)
+    size = model.batch if by_paths else max(1, BATCH // model.n_bins)
     for start in range(0, len(spots), size):
         part = spots[start : start + size]
         forward = _staged(
@@ -446,8 +446,3 @@ def towards_wall(model: SurfelModel) -> Tensor:
 def albedo_unit(albedo: Tensor) -> Tensor:
     """``[M]`` that albedo columns count in: the albedo itself, for weak surfels a twentieth of the mean."""
     return torch.maximum(albedo, 0.05 * albedo.mean())
-
-
-def path_batch(model: SurfelModel) -> int:
-    """Spots of about two million paths."""
-    return max(1, (1 << 21) // max(1, len(model) * model.quadrature**2))

@@ -589,10 +589,14 @@ class SurfelModel(nn.Module):
         signals = [hooks.gain(self.signal(self.arrived(p, hooks), hooks), p) for p in parts]
         return torch.cat(signals)[:, self.gate[0] :]
 
+    @property
+    def batch(self) -> int:
+        """Spots that have about two million paths together."""
+        return max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
+
     def _batches(self, spots: Tensor, rows: Tensor | None = None) -> tuple[Tensor, ...]:
         """Parts of some spots, or of what belongs to them."""
-        size = max(1, (1 << 21) // max(1, len(self) * self.quadrature**2))
-        return (spots if rows is None else rows).split(size)
+        return (spots if rows is None else rows).split(self.batch)
 
     def points(self) -> Points:
         """Surfel centres with normals and albedo."""
