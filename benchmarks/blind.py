@@ -2,6 +2,7 @@
 
     python benchmarks/blind.py run set=development first=0 number=40    diagnoses, stored as they are done
     python benchmarks/blind.py rows set=validation                   its rows into docs/blind_rows.jsonl
+    python benchmarks/blind.py values                                   true quantities into rows without them
     python benchmarks/blind.py report                                   docs/blind.md from those rows
     python benchmarks/blind.py sensitivity set=development commit=…     what other constants would have said
 
@@ -84,6 +85,19 @@ def keep_rows(set_name: str) -> None:
     ROWS.write_text("".join(json.dumps(row) + "\n" for row in kept))
 
 
+def add_values() -> None:
+    """True quantities into rows that were kept before these were: they follow from what was drawn."""
+    from wild_table import Spec
+    from wild_truth import true_values
+
+    rows = [json.loads(text) for text in ROWS.read_text().splitlines()]
+    for row in rows:
+        if "values" not in row:
+            drawn = {n: tuple(v) if isinstance(v, list) else v for n, v in row["spec"].items()}
+            row["values"] = true_values(Spec(**drawn)) if row["right"] else {}
+    ROWS.write_text("".join(json.dumps(row) + "\n" for row in rows))
+
+
 def interval(right: int, of: int) -> str:
     """Rate and its 95 % Clopper–Pearson interval."""
     from scipy.stats import beta
@@ -95,11 +109,15 @@ def interval(right: int, of: int) -> str:
     return f"{right} of {of} = {right / of:.0%} ({low:.0%} … {high:.0%})"
 
 
+def in_first_group(row: dict) -> bool:
+    """The one thing hidden stands in the group that is named first."""
+    (right,) = row["right"].values()
+    return bool(row["named"]) and bool(set(row["named"][0]) & set(right))
+
+
 def first_right(row: dict) -> bool:
     """The first name said, alone or in a group of two, is right."""
-    (hidden,) = row["right"]
-    group = row["named"][0] if row["named"] else {}
-    return 0 < len(group) <= 2 and bool(set(group) & set(row["right"][hidden]))
+    return in_first_group(row) and len(row["named"][0]) <= 2
 
 
 def likely_right(row: dict) -> bool:
@@ -137,6 +155,37 @@ def right_axis(row: dict) -> bool:
     return not row["named"] and bool(set(row["unknown"]) & set(row["axes"]))
 
 
+def said_of(row: dict) -> list[tuple[str, str, float, list[float]]]:
+    """Quantities of what was named rightly: name, quantity, true value, value and error that were said."""
+    return [
+        (name, quantity, true, row["parameters"][name][quantity])
+        for hidden, right in row["right"].items()
+        for name in right
+        for quantity, true in row.get("values", {}).get(hidden, {}).items()
+        if quantity in row["parameters"].get(name, ())
+    ]
+
+
+def within_two(row: dict) -> list[bool]:
+    """Of each such quantity, whether it is within two of its errors."""
+    return [abs(said - true) <= 2 * error for _, _, true, (said, error) in said_of(row)]
+
+
+def above_limit(row: dict) -> list[bool]:
+    """Of what is stronger than the diagnosis says would be named in nine of ten, whether it is named."""
+    named, found = {name for group in row["named"] for name in group}, []
+    for hidden, right in row["right"].items():
+        limits = [
+            abs(row["values"][hidden][quantity]) > limit
+            for name in right
+            for quantity, limit in row.get("limits", {}).get(name, {}).items()
+            if quantity in row["values"][hidden]
+        ]
+        if any(limits):
+            found.append(bool(set(right) & named))
+    return found
+
+
 def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     """What was asked for, and measured."""
     from wild_statistic import CLEAR
@@ -148,6 +197,10 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     faint = [c for c in by["single"] if not clear(c)]
     pairs = [c for c in by["pair"] if clear(c)]
     hidden = by["single"] + by["pair"]
+    told = [c for c in seen if c["named"]]
+    quantities = [known for c in hidden for known in within_two(c)]
+    expected = [named for c in hidden for named in above_limit(c)]
+    reached = [c for c in by["unknown"] if c.get("reached") is not None and right_axis(c)]
     return [
         (
             "false names on effect-free captures",
@@ -181,6 +234,26 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
             interval(sum(bool(wrong_names(c)) for c in hidden), len(hidden)),
         ),
         (
+            "true cause in the group that is named first, of clear single effects with one",
+            "85 – 95 %",
+            interval(sum(map(in_first_group, told)), len(told)),
+        ),
+        (
+            "… names in it, in the mean",
+            "≤ 1.5",
+            f"{sum(len(c['named'][0]) for c in told) / len(told):.2f}" if told else "–",
+        ),
+        (
+            "quantities of what is named rightly within two reported errors",
+            "≥ 90 %",
+            interval(sum(quantities), len(quantities)),
+        ),
+        (
+            "named where stronger than the limit that the diagnosis states",
+            "≥ 90 %",
+            interval(sum(expected), len(expected)),
+        ),
+        (
             "pairs: both named (both statistics clear)",
             "≥ 90 %",
             interval(sum(map(all_right, pairs)), len(pairs)),
@@ -194,6 +267,11 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
             "unknown: nothing named, and a free term along the right axis",
             "≥ 90 %",
             interval(sum(map(right_axis, by["unknown"])), len(by["unknown"])),
+        ),
+        (
+            "unknown: at least 80 % of what the true cause gains, of those with a right axis",
+            "≥ 80 %",
+            interval(sum(c["reached"] >= 0.8 for c in reached), len(reached)),
         ),
         ("diagnoses that failed", "0", interval(sum(bool(c["error"]) for c in cases), len(cases))),
     ]
@@ -342,6 +420,8 @@ def main(arguments: list[str]) -> None:
         run(given.get("set", "development"), first, number, processes)
     elif what == "rows":
         keep_rows(given["set"])
+    elif what == "values":
+        add_values()
     elif what == "report":
         report()
     elif what == "sensitivity":

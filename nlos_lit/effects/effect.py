@@ -143,6 +143,10 @@ class Effect(nn.Module, Hooks):
         """
         self.reset()
 
+    def part_of(self) -> dict[str, float]:
+        """Values by which it does what it does now, and what a scene may have taken up; empty: none."""
+        return {}
+
     @torch.no_grad()
     def clamp(self) -> None:
         """Bring every parameter back within its bounds, after a step of an optimiser."""

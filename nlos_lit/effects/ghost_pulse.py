@@ -11,6 +11,7 @@ from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import convolve, whole_record
 
+SHORTEST = 4  # bins; what comes again earlier belongs to the pulse
 SOONEST = 8  # bins; what comes again earlier cannot be told from how the light of a spot rises and falls
 PART = 1024  # spots whose spectra are held at once
 
@@ -48,8 +49,8 @@ class GhostPulse(Effect):
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        delay, delays = 4.0, []
-        while delay <= max(0.6 * scan.n_bins, 4.0):
+        delay, delays = float(SHORTEST), []
+        while delay <= max(0.6 * scan.n_bins, SHORTEST):
             delays.append(delay * scan.bin_length)
             delay = delay + 3 if delay < 40 else 1.06 * delay
         longest = max(scan.n_bins, 5) * scan.bin_length
@@ -68,6 +69,13 @@ class GhostPulse(Effect):
         self.reset()
         self.set("fraction", self.declared["fraction"].scale)
         self.set("delay", repeats_after(counts) * self.scan.bin_length)
+
+    def part_of(self) -> dict[str, float]:
+        """Echoes at half the delay, of which these are every second one."""
+        fraction, delay, again = (float(self.value(p).detach()) for p in ("fraction", "delay", "again"))
+        if min(fraction, again) <= 0 or delay < 2 * SHORTEST * self.scan.bin_length:
+            return {}
+        return {"fraction": fraction / again**0.5, "delay": delay / 2, "again": again**0.5}
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)

@@ -300,7 +300,7 @@ class Loop:
         for kind, members in kinds.items():
             extension = copy_effects(Extension([]), [self._at_first(m.candidate, base) for m in members])
             text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
-            jobs.append((text, f"begun{kind}", partial(self._or_base, base, extension)))
+            jobs.append((text, f"begun{kind}", partial(self._built_or, base, extension)))
         self.steps.plan(fit=len(jobs))
         return dict(zip(kinds, self.steps.several("fit", jobs, self.settings.processes), strict=True))
 
@@ -312,10 +312,10 @@ class Loop:
             effect.set_all({p.name: candidate.effect.value(p.name) for p in effect.shapes})
         return effect.requires_grad_(True)
 
-    def _or_base(self, base: SurfelFit, extension: Extension) -> SurfelFit:
-        """A scene built with the effects, or the base, where no surfel survives with them."""
+    def _built_or(self, other: SurfelFit, extension: Extension) -> SurfelFit:
+        """A scene built with the effects, or the other, where no surfel survives with them."""
         fit = _rebuilt(self.rebuild, extension, self.seed)
-        return base if fit is None else fit
+        return other if fit is None else fit
 
     def next(self, pool: Pool, free: bool) -> list[Member]:
         """Who comes into the parsimonious scene.
@@ -489,6 +489,31 @@ class Loop:
                 coarse, fine = known or (self.built_with(coarse, names), None)
                 scene = self.better(fine or self.fine(coarse, f"with_{'_'.join(names)}"), coarse)
         return Standing(staying, away, scene, coarse), whole
+
+    def whole(self, coarse: SurfelFit) -> SurfelFit:
+        """A parsimonious scene whose terms do all that they stand for.
+
+        A scene that has taken up the first of some echoes leaves every second one to be found, and no step
+        leads from there to the first.
+
+        Args:
+            coarse: the scene.
+
+        Returns:
+            It, or one built anew from what its terms may be a part of, for as long as that predicts better.
+        """
+        turn = 0
+        while parts := {e.name: more for e in coarse.extension.effects if (more := e.part_of())}:
+            extension = copy_effects(coarse.extension, [])
+            for effect in extension.effects:
+                effect.set_all(parts.get(effect.name, {}))
+            text, kept = f"building a scene with more of {', '.join(parts)}", f"whole{self.number}_{turn}"
+            self.steps.plan(fit=1)
+            fit = self.steps("fit", text, kept, partial(self._built_or, coarse, extension))
+            if self.better(coarse, fit) is coarse:
+                break
+            coarse, turn = fit, turn + 1
+        return coarse
 
     def built_with(self, coarse: SurfelFit, names: Sequence[str]) -> SurfelFit:
         """A parsimonious scene with some of its terms: gone on with, or built anew.
@@ -924,8 +949,10 @@ def criticise(
 
     def with_those(new: list[Member], beside: Held) -> Held:
         """What holds of those that came, beside what is held."""
+        nonlocal coarse
         if not new:
             return beside
+        coarse = loop.whole(coarse)
         grown = begun.scene if coarse is begun.coarse else loop.grown(coarse, "with_all")
         tried, scene, left = loop.hold(new, grown, coarse, beside)
         now = {m.name: m for m in tried}

@@ -8,18 +8,23 @@ from __future__ import annotations
 import tempfile
 import time
 import traceback
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+import torch
 from blind_judge import pipeline_for
 from wild_statistic import true_statistics
-from wild_truth import make
+from wild_truth import Truth, make, write
 
 from data_modules.readers import read_capture
+from nlos_lit.capture import Capture
 from nlos_lit.inference.criticise import CriticismSettings
-from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.diagnose import diagnose, split_of
+from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.members import Findings
 from nlos_lit.inference.result import Diagnosis
+from nlos_lit.metrics.transients import poisson_deviance
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,9 @@ class Outcome:
         tried: of each term what was found when it was last asked for: own and needed nats, gain of the select
             spots and its error, weight, explained share, whether it was accepted, and the nats of those
             needed that are for what other terms take from it.
+        values: true quantities of each thing hidden, under a registry's names where they mean the same.
+        limits: by right name and quantity what would be named in nine of ten, by the diagnosis itself.
+        reached: of an unknown, see :func:`reached`.
         error: what went wrong.
     """
 
@@ -57,6 +65,9 @@ class Outcome:
     largest: tuple[str, float] = ("", 0.0)
     likely: list[str] = field(default_factory=list)
     tried: dict[str, list[float]] = field(default_factory=dict)
+    values: dict[str, dict[str, float]] = field(default_factory=dict)
+    limits: dict[str, dict[str, float]] = field(default_factory=dict)
+    reached: float | None = None
     seconds: float = 0.0
     error: str = ""
 
@@ -78,13 +89,42 @@ def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
         "statistics": {
             n: [round(s.plain, 1), round(s.projected, 1)] for n, s in true_statistics(truth).items()
         },
+        "values": truth.values,
     }
     began = time.process_time()
     try:
         diagnosis, found = diagnose(capture, pipeline_for(capture), options, name=path.stem, seed=0)
     except Exception:  # a failure counts against the rates, and the others go on
         return Outcome(**known, error=traceback.format_exc(limit=-2), seconds=time.process_time() - began)
-    return Outcome(**known, **said(diagnosis, found), seconds=time.process_time() - began)
+    seconds, right = time.process_time() - began, {n for names in truth.right.values() for n in names}
+    known["limits"] = {s.name: s.detectable for s in diagnosis.screened if s.name in right}
+    if truth.unknown:
+        known["reached"] = reached(truth, capture, diagnosis)
+    return Outcome(**known, **said(diagnosis, found), seconds=seconds)
+
+
+def reached(truth: Truth, capture: Capture, diagnosis: Diagnosis) -> float:
+    """Share of what a perfectly known cause gains over the base that the diagnosis gains, on untouched spots.
+
+    The cause is taken from the simulator: by how much it changes each bin's light. It acts on a scene of
+    counts without it, which has not bent to it, and is as far from the truth as other scenes are.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "capture.hdf5"
+        write(replace(truth, counts=np.random.default_rng([truth.spec.seed, 3]).poisson(truth.without)), path)
+        before = read_capture(path, "auto")
+    assert before.gate == capture.gate
+    pipeline, split = pipeline_for(before), split_of(before)
+    coarse = pipeline(before, split, 0)
+    scenes = coarse, pipeline.grow(coarse, 0)
+    scene = max(scenes, key=lambda fit: float(log_likelihood(fit, split.select).sum()))
+    spots, (first, last) = split_of(capture).test, capture.gate
+    change = torch.from_numpy((truth.expected / truth.without)[spots, first:last])
+    with torch.no_grad():
+        light = scene.model.expected(torch.from_numpy(spots), scene.extension).double() * change
+    known = poisson_deviance(torch.from_numpy(capture.gated_counts()[spots]).double(), light).mean()
+    base, extended = (diagnosis.untouched_test[n].deviance_per_bin for n in ("base", "extended"))
+    return (base - extended) / (base - float(known))
 
 
 def said(diagnosis: Diagnosis, found: Findings) -> dict:

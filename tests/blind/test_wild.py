@@ -30,7 +30,7 @@ from wild_statistic import (
     true_statistics,
 )
 from wild_table import ALL, BLOCK, LENGTH, MASTER_SEEDS, Spec, _block, seed_of, spec_of, table
-from wild_truth import hide, make, scan_order, write
+from wild_truth import hide, make, scan_order, true_values, write
 from wild_unknown import UNKNOWN
 from wild_work import WildWork
 
@@ -204,6 +204,12 @@ def test_geometry_by_hand():
         work.light.sum(axis=1) / scene.clean.sum(axis=1), 0.75 + 0.25 * back, rtol=1e-9
     )
     work = work_on(scene)
+    values = inject.gloss(work, 0.4)
+    tall, c = 1 / values["rough"] ** 2, half.min() ** -1 * DOT[2]
+    brighter = (work.light.sum(axis=1) / scene.clean.sum(axis=1))[half.argmin()]
+    # The registry's lobe, (p + 2)/2 cos^p, as bright at its middle and as wide: p = 2/m² - 2.
+    assert brighter == pytest.approx(1 + values["strength"] * tall * c ** (2 * tall - 2), rel=1e-3)
+    work = work_on(scene)
     inject.occluder_ragged(work, 1.0)
     assert set(np.unique((work.light.sum(axis=1) / scene.clean.sum(axis=1)).round(9))) == {0.0, 1.0}
 
@@ -304,7 +310,7 @@ def test_counting_by_hand():
     values = inject.gate_erf(work, 0.3)
     gate = work.counting[-1](np.ones((1, 240)))[0]
     assert gate[0] == pytest.approx(0.7)
-    assert gate[5] == pytest.approx(ndtr(5 * work.bin / values["width"] + 0.524401), rel=1e-5)
+    assert gate[5] == pytest.approx(ndtr(5 * work.bin / values["soft"] + 0.524401), rel=1e-5)
     work = work_on(dot())
     period = int(inject.code_widths(work, 0.1)["period"])
     width = work.counting[-1](np.ones((1, 240)))[0]
@@ -448,6 +454,11 @@ def test_files_tell_nothing_and_repeat(tmp_path):
     truth = make("development", index, tmp_path / "made.hdf5")
     assert truth.spec == spec_of("development", index)
     np.testing.assert_array_equal(read_capture(tmp_path / "made.hdf5").counts, truth.counts)
+
+
+def test_true_values_are_those_of_the_capture():
+    spec = Spec("letters", effects=("mode_hops", "gloss"), strengths=(1, 1), seed=4, side=SIDE)
+    assert true_values(spec) == hide(spec).values
 
 
 def test_no_code_is_shared_with_what_is_tested():

@@ -97,7 +97,7 @@ def jitter_heavy(work: WildWork, bins: float) -> Values:
     )
     jitter = bins * work.bin * np.clip(drawn, -6, 6)
     work.delay = work.delay + jitter
-    return {"rms": float(jitter.std())}
+    return {"sigma": float(jitter.std())}
 
 
 def clock_scale(work: WildWork, scale: float) -> Values:
@@ -215,7 +215,7 @@ def gate_erf(work: WildWork, depth: float) -> Values:
     opens, closes = -width * ndtri(1 - depth), -width * ndtri(1 - end)
     gate = ndtr((work.times - opens) / width) * ndtr((work.times[::-1] - closes) / width)
     work.count(lambda m: m * gate)
-    return {"start": depth, "end": end, "width": width * work.bin}
+    return {"start": depth, "end": end, "soft": width * work.bin}
 
 
 def spot_gates(work: WildWork, share: float) -> Values:
@@ -255,7 +255,8 @@ def retro_paint(work: WildWork, share: float) -> Values:
 
 
 def gloss(work: WildWork, strength: float) -> Values:
-    """A Beckmann lobe about the half vector."""
+    """A Beckmann lobe about the half vector; of a lobe as bright at its middle and as wide the registry's
+    strength is a quarter."""
     rough = float(work.rng.uniform(0.15, 0.45))
 
     def lobe(legs: Legs) -> np.ndarray:
@@ -266,14 +267,14 @@ def gloss(work: WildWork, strength: float) -> Values:
         return 1 + strength * np.exp((1 - 1 / square) / rough**2) / (4 * rough**2 * square**2)
 
     work.light = work.scene.rendered((lobe,))
-    return {"strength": strength, "rough": rough}
+    return {"strength": strength / 4, "rough": rough}
 
 
 def fourth_bounces(work: WildWork, times: float) -> Values:
     """The scene's own fourth bounce, ``times`` as strong as its albedos make it."""
     more = times * work.scene.fourth()
     work.light = work.light + more
-    return {"strength": times, "share": float(more.sum() / work.light.sum())}
+    return {"times": times, "share": float(more.sum() / work.light.sum())}
 
 
 def occluder_ragged(work: WildWork, opacity: float) -> Values:

@@ -70,7 +70,7 @@ def write(truth: Truth, path: str | Path) -> None:
 
 def hide(spec: Spec) -> Truth:
     """The truth without a file."""
-    names = tuple(sorted(spec.effects, key=list(ALL).index))
+    names = _in_order(spec)
     whole, values = _measured(spec, names)
     expected = whole.expected()
     without = _measured(spec, ())[0].expected() if names else expected
@@ -97,6 +97,16 @@ def hide(spec: Spec) -> Truth:
         response=(whole.sigma * whole.bin, whole.bin / whole.kappa),
         dark=whole.dark,
     )
+
+
+def true_values(spec: Spec) -> dict[str, dict[str, float]]:
+    """True quantities of each injection, as in a :class:`Truth`, without its light."""
+    return _measured(spec, _in_order(spec))[1]
+
+
+def _in_order(spec: Spec) -> tuple[str, ...]:
+    """Names of the injections in the order of the light's way."""
+    return tuple(sorted(spec.effects, key=list(ALL).index))
 
 
 def _measured(spec: Spec, names: tuple[str, ...]) -> tuple[WildWork, dict[str, dict[str, float]]]:

@@ -55,6 +55,28 @@ def test_echoes_stand_at_their_delays():
     assert expected[16:18] == pytest.approx([0.2 * 0.5 * 0.5, 0.2 * 0.5 * 0.5]), "the second, 14.5 bins late"
 
 
+def test_echoes_may_be_every_second_one_of_others():
+    """What lies between them is what the scene may have taken up."""
+    kernel = torch.zeros(6)
+    kernel[2] = 1.0
+    ghost = effect("ghost_pulse", fraction=0.03, delay=12 * BIN, again=0.25)
+    seen = ghost.response(kernel, 2).detach()
+    ghost.set_all(ghost.part_of())
+    whole = ghost.response(kernel, 2).detach()
+    between = whole - seen
+    assert between[8 : 2 + LAST : 12] == pytest.approx(
+        0.06 * 0.25 ** torch.arange(len(between[8::12])), abs=1e-8
+    )
+    between[8 : 2 + LAST : 12] = 0
+    assert between.abs().max().item() < 1e-7
+    assert ghost.part_of() == {}, "the next would come three bins late"
+    for name in ("fraction", "again"):
+        assert (
+            effect("ghost_pulse", **{"fraction": 0.1, "delay": 8 * BIN, "again": 0.2, name: 0}).part_of()
+            == {}
+        )
+
+
 class Response(torch.nn.Module):
     """What an effect makes of a response."""
 

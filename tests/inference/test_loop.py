@@ -379,6 +379,49 @@ def test_a_scene_begins_with_echoes_where_the_counts_repeat_or_the_pool_asks(mon
     assert seen[0] is base.counts
 
 
+@pytest.mark.parametrize(("halves", "built"), [(0, 1), (1, 2), (2, 2)])
+def test_echoes_are_halved_for_as_long_as_other_spots_gain(monkeypatch, halves, built):
+    world, bins = World(monkeypatch, {}, []), SCAN.bin_length
+    coarse = fitted("ghost_pulse")
+    (echo,) = coarse.extension.effects
+    echo.set_all({"fraction": 0.01, "delay": 18 * bins, "again": 0.0625})
+    best = 18 * bins / 2**halves
+
+    def likelihood(fit: FakeFit, spots: np.ndarray) -> Tensor:
+        (effect,) = fit.extension.effects
+        return nats(-abs(math.log(effect.value("delay").item() / best)))
+
+    monkeypatch.setattr(loop, "log_likelihood", likelihood)
+    whole = world.loop().whole(coarse)
+    (found,) = whole.extension.effects
+    values = [found.value(n).item() for n in ("fraction", "delay", "again")]
+    asked = {0: (0.01, 18, 0.0625), 1: (0.04, 9, 0.25), 2: (0.08, 4.5, 0.5)}[halves]
+    assert values == pytest.approx([asked[0], asked[1] * bins, asked[2]], rel=1e-4)
+    assert len(world.rebuilt) == built
+    assert (whole is coarse) == (halves == 0)
+    assert echo.value("delay").item() == pytest.approx(18 * bins), "what was there is as it was"
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_what_is_told_of_echoes_is_told_of_the_whole(monkeypatch, there):
+    """Terms are held beside the scene that has all echoes, if that predicts better."""
+    world = World(monkeypatch, {"ghost_pulse": gaining(4.0)}, [candidate("ghost_pulse", 300.0)])
+    likelihood = world.likelihood
+
+    def halved(fit: FakeFit) -> bool:
+        return any(
+            e.name == "ghost_pulse" and e.value("delay") < 10 * SCAN.bin_length for e in fit.extension.effects
+        )
+
+    monkeypatch.setattr(
+        loop, "log_likelihood", lambda fit, spots: likelihood(fit, spots) + there * halved(fit) * gaining(1.0)
+    )
+    world.pool[0].effect.set_all({"fraction": 0.1, "delay": 16 * SCAN.bin_length, "again": 0.25})
+    found = world.criticise()
+    assert [m.name for m in found.accepted] == ["ghost_pulse"]
+    assert halved(found.final) == there
+
+
 @pytest.mark.parametrize(("more", "effects"), [(2.9, False), (3.0, True)])
 def test_what_a_luckier_scene_gains_is_not_said_of_its_effects(monkeypatch, more, effects):
     """A scene built with an effect is as good without it but for less than ln 19 nats: that is the base,
