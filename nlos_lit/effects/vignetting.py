@@ -14,28 +14,30 @@ from nlos_lit.effects.words import EffectWords
 
 
 class Vignetting(Effect):
-    """Spots away from the middle of the scanned wall are darker (or, with the other sign, brighter).
+    """Spots away from the axis of the optics are darker.
 
-    ``signal → signal · e^{-strength |x|²}``, x the spot's place in [-1, 1]²; |x|² of laser and sensor added
-    where both move.
+    ``signal → signal · (1 + strength |x - c|²/2)^{-2}``, the cos⁴ of the angle to the axis; x is the spot's
+    place and c where the axis meets the wall, both in half sides of the scan; the product of laser's and
+    sensor's where both move.
 
-    Parameters: ``strength`` (1), null 0, of either sign.
+    Parameters: ``strength`` (1), null 0: about how much of the logarithm is lost half a side from the axis.
+    ``x``, ``y`` (m): where the axis meets the wall, in the scan; begun at its middle.
 
-    Signature: spot totals fall off radially from the wall's centre; the shape in time is right.
+    Signature: spot totals fall off radially from a point of the wall; the shape in time is right.
 
     Degenerate with: ``wall_reflectance`` (any smooth map), ``retroreflection`` of a shallow scene before the
-    wall's centre, normals.
+    axis, normals.
 
-    Source: to second order the cos⁴ law of lenses: B. K. P. Horn, *Robot Vision*, 1986, ch. 10.
+    Source: the cos⁴ law of lenses: B. K. P. Horn, *Robot Vision*, 1986, ch. 10.
     """
 
     name = "vignetting"
     followed_by = ("free_wall",)
     words = EffectWords(
-        phrase="a brightness that changes from the middle of the scan to its edge",
+        phrase="a brightness that falls off around the axis of the optics",
         cause="Lens, mirrors or an aperture pass less light at the edge of the field.",
         remedy="Open the aperture, re-centre the optics, or measure a flat field.",
-        headline="{strength} darker at the edge (log gain)",
+        headline="about {strength} darker half a side of the scan from the axis, which is at {x}, {y}",
     )
     split_by: ClassVar = {
         "wall_reflectance": "a capture with the optics shifted against the wall",
@@ -43,20 +45,22 @@ class Vignetting(Effect):
     }
     witness = "energy"
 
-    square: Tensor
-
-    def __init__(self, scan: Scan) -> None:
-        super().__init__(scan)
-        squares = [place.square().sum(1) for place in scan.places]
-        self.register_buffer("square", sum(squares[1:], squares[0]), persistent=False)
-
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
-        return (Parameter("strength", "1", 0.0, 0.05, -2.0, 2.0, kind="percent"),)
+        half = scan.half
+        axis = (
+            Parameter(name, "m", None, 0.1 * half, at - half, at + half, grid=(at,), kind="length")
+            for name, at in zip("xy", scan.centre.tolist(), strict=True)
+        )
+        return (Parameter("strength", "1", 0.0, 0.05, 0.0, 2.0, kind="percent"), *axis)
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
         return {"strength": 0.4}
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        return signal * torch.exp(-self.value("strength") * self.square[spots])[:, None]
+        axis = torch.stack([self.value("x"), self.value("y")])
+        axis = (axis - self.scan.centre.to(axis)) / self.scan.half
+        away = [(place.to(axis)[spots] - axis).square().sum(1) for place in self.scan.places]
+        lost = [torch.log1p(0.5 * self.value("strength") * square) for square in away]
+        return signal * torch.exp(-2 * torch.stack(lost).sum(0))[:, None]

@@ -261,8 +261,10 @@ def test_responses_by_hand():
 def test_gains_and_backgrounds_by_hand():
     work = work_on(dot())
     values = inject.vignetting_cos4(work, 0.4)
-    away = np.hypot(*(work.scene.places - [values["x"], values["y"]]).T)
+    points = work.scene.sensor[:, :2]
+    away = np.hypot(*(points - [values["x"], values["y"]]).T) / (points[:, 0].max() - points[:, 0].mean())
     np.testing.assert_allclose(work.gain, np.cos(np.arctan(away * np.sqrt(0.6**-0.5 - 1))) ** 4, rtol=1e-9)
+    np.testing.assert_allclose(work.gain, (1 + values["strength"] * away**2 / 2) ** -2, rtol=1e-9)
     assert work.expected().sum() == pytest.approx(SPOTS * (1000 + 240 * work.dark), rel=1e-6)
     work = work_on(dot())
     inject.leak_power_law(work, 5.0)

@@ -140,12 +140,15 @@ def wall_scratches(work: WildWork, loss: float) -> Values:
 
 
 def vignetting_cos4(work: WildWork, corner: float) -> Values:
-    """cos⁴ of the field angle about a centre of its own; ``corner`` is what is lost at one from it."""
+    """cos⁴ of the field angle about a centre of its own; ``corner`` is what is lost half a side from it."""
     centre = work.rng.uniform(-0.35, 0.35, 2)
     slope = (1 - corner) ** -0.5 - 1
     away = ((work.scene.places - centre) ** 2).sum(axis=1)
     work.gain = work.gain / (1 + slope * away) ** 2
-    return {"corner": corner, "x": float(centre[0]), "y": float(centre[1])}
+    points = work.scene.sensor[:, :2]
+    half, middle = np.ptp(points, axis=0).max() / 2, (points.max(axis=0) + points.min(axis=0)) / 2
+    x, y = middle + half * centre
+    return {"strength": 2 * slope, "x": float(x), "y": float(y)}
 
 
 def ambient_window(work: WildWork, share: float) -> Values:

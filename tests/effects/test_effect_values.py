@@ -107,8 +107,12 @@ def test_gains_of_spots():
     signal, spots = torch.full((2, LAST), 3.0), torch.tensor([4, 1])
     scan = scene("confocal")[1]
     place = scan.places[0]
-    vignetting = effect("vignetting", strength=0.3).gain(signal, spots).detach()
-    assert vignetting[:, 7] == pytest.approx(3 * torch.exp(-0.3 * (place[spots] ** 2).sum(1)), rel=1e-5)
+    aside = scan.half * torch.tensor([0.5, -0.25])
+    at = dict(zip("xy", (scan.centre + aside).tolist(), strict=True))
+    for where, axis in (({}, [0.0, 0.0]), (at, [0.5, -0.25])):
+        vignetting = effect("vignetting", strength=0.3, **where).gain(signal, spots).detach()
+        angle = torch.atan(((place[spots] - torch.tensor(axis)) ** 2).sum(1).sqrt() * 0.15**0.5)
+        assert vignetting[:, 7] == pytest.approx(3 * torch.cos(angle) ** 4, rel=1e-5)
     drift = effect("power_drift")
     values = torch.zeros(drift.declared["drift"].size)
     values[:5] = torch.tensor([0.1, -0.2, 0.0, 0.3, 0.05])

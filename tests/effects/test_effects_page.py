@@ -41,4 +41,4 @@ def test_the_table_lists_the_registry():
         assert {p.unit for p in declared} == set(re.findall(r"\((1|m|rad|bins|counts/bin)\)", row[3])), (
             effect.name
         )
-        assert any(p.null is None for p in declared) == ("scanned" in row[3]), effect.name
+        assert any(len(p.grid) > 1 for p in declared) == ("scanned" in row[3]), effect.name

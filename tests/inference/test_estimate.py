@@ -115,13 +115,13 @@ def test_hot_spots_are_counted_for_the_whole_scan():
 
 
 def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, Tensor, Tensor]:
-    """64 spots in 16 blocks with a gain and pile-up at their true values; counts drawn, or exactly expected
-    with no seed.
+    """64 spots in 16 blocks with a background that slopes and pile-up at their true values; counts drawn, or
+    exactly expected with no seed.
     """
     scene = capture_of(raster(8))
     model, scan = surfels(scene, level=40.0), Scan.of(scene)
     extension = Extension(
-        [effect_of("vignetting", scan, strength=0.3), effect_of("pile_up", scan, detections=0.3)]
+        [effect_of("background_slope", scan, slope=0.3), effect_of("pile_up", scan, detections=0.3)]
     )
     spots, block = torch.arange(64), torch.arange(64) // 16 * 4 + torch.arange(64) % 8 // 2
     patches = (
