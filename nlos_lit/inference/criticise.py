@@ -38,7 +38,7 @@ from nlos_lit.inference.members import (
     weighed,
 )
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, Pool, ask, each_once, lost, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ahead_of, ask, each_once, lost, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -988,7 +988,8 @@ def criticise(
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)
-        new = [replace(m, rivals=each_once(*m.rivals, *rivals)) for m in new]
+        alike = [c for c in rivals if not c.free]
+        new = [replace(m, rivals=each_once(*m.rivals, *ahead_of(m.candidate, rivals), *alike)) for m in new]
         found.members = found.members + new
         told(first, coarse, found.members)
     effects = with_those(joined_by(new, free=False), start)

@@ -279,8 +279,7 @@ def together(
             asked = beside(before)
             same = [c for c in before if c.effect.twin_of(first.effect)]
             rivals = each_once(*same, *lost(before, asked, least))
-            ahead = [] if free or taken else [c for c in candidates if _leads(c, first)][:1]
-            taken.append(Taken(first, ahead + rivals))
+            taken.append(Taken(first, rivals if free or taken else ahead_of(first, candidates) + rivals))
             waiting = {c.name for c in rivals}
             asked = [c for c in asked if c.loud > least and c.name not in waiting]
     return taken
@@ -311,9 +310,18 @@ def each_once(*candidates: Candidate) -> list[Candidate]:
     return list(found.values())
 
 
-def _leads(candidate: Candidate, effect: Candidate) -> bool:
-    """It is a free term that is asked for more than an effect."""
-    return candidate.free and not candidate.effect.per_spot and candidate.evidence > effect.evidence
+def ahead_of(effect: Candidate, candidates: list[Candidate]) -> list[Candidate]:
+    """The free term that is asked for most, where that is more than an effect is asked for.
+
+    Args:
+        effect: of the registry.
+        candidates: by falling evidence.
+
+    Returns:
+        One term, or none.
+    """
+    free = [c for c in candidates if c.free and not c.effect.per_spot]
+    return [c for c in free[:1] if c.evidence > effect.evidence]
 
 
 def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:

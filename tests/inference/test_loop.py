@@ -461,6 +461,24 @@ def test_what_lost_its_evidence_may_be_meant_instead(monkeypatch):
     assert member.name == "pile_up"
 
 
+@pytest.mark.parametrize(("evidence", "rivals"), [(61.0, ["free_wall", "pile_up"]), (59.0, ["pile_up"])])
+def test_of_free_terms_only_one_that_leads_may_be_meant_instead(monkeypatch, evidence, rivals):
+    """They can do what most effects do, and would leave no room for effects that look alike."""
+    free = [candidate("free_wall", evidence), candidate("free_time", 58.0)]
+    pool = [free[0], candidate("irf_tail", 60.0), free[1], candidate("pile_up", 50.0)]
+    pool = sorted(pool, key=lambda c: -c.evidence)
+    table = {"anew+irf_tail": nats(30.0), "fine+anew+irf_tail": nats(60.0), "irf_tail": nats(60.0)}
+    world = World(monkeypatch, table, pool, {"irf_tail": 60.0}, imitated=(("irf_tail",),))
+
+    def asked(fit, *_):
+        left = [replace(c, evidence=0.0) if "irf_tail" in fit.names else c for c in pool]
+        return Pool([c for c in left if c.name not in fit.names], [])
+
+    monkeypatch.setattr(loop, "ask", asked)
+    (member,) = world.criticise().members
+    assert names_of(member.rivals) == rivals
+
+
 def test_rivals_of_what_is_asked_for_come_first(monkeypatch):
     """A scene is begun with a drift, of which a line's delay is the rival; a leak loses its evidence, too."""
     pool = [candidate("time_drift", 50.0), candidate("irf_tail", 0.0), candidate("line_delay", 50.0)]
