@@ -201,6 +201,7 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     quantities = [known for c in hidden for known in within_two(c)]
     expected = [named for c in hidden for named in above_limit(c)]
     reached = [c for c in by["unknown"] if c.get("reached") is not None and right_axis(c)]
+    reached = [c for c in reached if "spot" not in c["axes"]]  # what a spot has says nothing of others
     return [
         (
             "false names on effect-free captures",

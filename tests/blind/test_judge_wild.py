@@ -82,7 +82,12 @@ def test_limits_are_held_against_what_is_as_strong(limit, named):
 
 @pytest.mark.parametrize(
     ("case", "counted"),
-    [(UNKNOWN, "1 of 1"), (UNKNOWN | {"reached": 0.79}, "0 of 1"), (UNKNOWN | {"unknown": ["time"]}, "–")],
+    [
+        (UNKNOWN, "1 of 1"),
+        (UNKNOWN | {"reached": 0.79}, "0 of 1"),
+        (UNKNOWN | {"unknown": ["time"]}, "–"),
+        (UNKNOWN | {"axes": ["spot", "wall"]}, "–"),
+    ],
 )
 def test_free_terms_are_held_against_the_true_cause(case, counted):
     older = {name: value for name, value in case.items() if name != "reached"}
