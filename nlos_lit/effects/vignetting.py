@@ -45,6 +45,13 @@ class Vignetting(Effect):
     }
     witness = "energy"
 
+    places: Tensor
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.middle = scan.centre.tolist()
+        self.register_buffer("places", torch.stack(scan.places), persistent=False)
+
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         half = scan.half
@@ -59,8 +66,7 @@ class Vignetting(Effect):
         return {"strength": 0.4}
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        axis = torch.stack([self.value("x"), self.value("y")])
-        axis = (axis - self.scan.centre.to(axis)) / self.scan.half
-        away = [(place.to(axis)[spots] - axis).square().sum(1) for place in self.scan.places]
-        lost = [torch.log1p(0.5 * self.value("strength") * square) for square in away]
-        return signal * torch.exp(-2 * torch.stack(lost).sum(0))[:, None]
+        x, y = ((self.value(n) - at) / self.scan.half for n, at in zip("xy", self.middle, strict=True))
+        square = (self.places[:, spots] - torch.stack([x, y])).square().sum(2)
+        lost = torch.log1p(0.5 * self.value("strength") * square).sum(0)
+        return signal * torch.exp(-2 * lost)[:, None]
