@@ -128,7 +128,7 @@ def test_the_witness_knows_the_gain():
         effect_of("irf_tail", scan, fraction=0.2, decay=0.2),
     ]
     x, y = scan.places[0].numpy().T
-    true = -0.5 * (x**2 + y**2)
+    true = -2 * np.log1p(0.25 * (x**2 + y**2))
     fit = SimpleNamespace(extension=Extension(effects))
     assert log_gain(fit, 64) == pytest.approx(true, abs=1e-5)
     seen = pulse_capture(gains=np.exp(true))
