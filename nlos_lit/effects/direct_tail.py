@@ -48,7 +48,6 @@ class DirectTail(Effect):
     name = "direct_tail"
     followed_by = ("free_time", "free_wall_background")
     with_power = ("amplitude",)
-    imitated = "light"
     words = EffectWords(
         phrase="direct light that strays from the laser's spot into the gate",
         cause="The very bright first return at the laser's spot is scattered within the detector's optics, "

@@ -171,7 +171,7 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
         scene, second, options, name="x", seed=0, folder=tmp_path, report=lambda text, *_: said.append(text)
     )
     assert said[0].startswith("rebuilding the scene")
-    light = ("retroreflection", "irf_tail", "wall_reflectance", "ambient_map", "direct_tail")
+    light = ("retroreflection", "irf_tail", "wall_reflectance", "ambient_map")
     geometry = ("wall_tilt", "wall_scale", "laser_sensor_baseline", "time_offset", "clock_scale")
     echoes = ("higher_order_bounces", "ghost_pulse")
     begun = [(0, names, fine) for fine in (False, True) for names in (light, geometry, echoes)]
