@@ -155,20 +155,17 @@ def right_axis(row: dict) -> bool:
     return not row["named"] and bool(set(row["unknown"]) & set(row["axes"]))
 
 
-def said_of(row: dict) -> list[tuple[str, str, float, list[float]]]:
-    """Quantities of what was named rightly: name, quantity, true value, value and error that were said."""
-    return [
-        (name, quantity, true, row["parameters"][name][quantity])
-        for hidden, right in row["right"].items()
-        for name in right
-        for quantity, true in row.get("values", {}).get(hidden, {}).items()
-        if quantity in row["parameters"].get(name, ())
-    ]
-
-
 def within_two(row: dict) -> list[bool]:
-    """Of each such quantity, whether it is within two of its errors."""
-    return [abs(said - true) <= 2 * error for _, _, true, (said, error) in said_of(row)]
+    """Of each quantity of what is named rightly, whether it is within two of the errors that were said."""
+    found = []
+    for hidden, right in row["right"].items():
+        for name in right:
+            said = row["parameters"].get(name, {})
+            for quantity, true in row.get("values", {}).get(hidden, {}).items():
+                if quantity in said:
+                    value, error = said[quantity]
+                    found.append(abs(value - true) <= 2 * error)
+    return found
 
 
 def above_limit(row: dict) -> list[bool]:
@@ -198,10 +195,11 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     pairs = [c for c in by["pair"] if clear(c)]
     hidden = by["single"] + by["pair"]
     told = [c for c in seen if c["named"]]
-    quantities = [known for c in hidden for known in within_two(c)]
+    quantities = [held for c in hidden for held in within_two(c)]
     expected = [named for c in hidden for named in above_limit(c)]
-    reached = [c for c in by["unknown"] if c.get("reached") is not None and right_axis(c)]
-    reached = [c for c in reached if "spot" not in c["axes"]]  # what a spot has says nothing of others
+    # What each spot has by itself says nothing of untouched ones.
+    known = [c for c in by["unknown"] if right_axis(c) and "spot" not in c["axes"]]
+    reached = [c["reached"] >= 0.8 for c in known if c.get("reached") is not None]
     return [
         (
             "false names on effect-free captures",
@@ -272,7 +270,7 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
         (
             "unknown: at least 80 % of what the true cause gains, of those with a right axis",
             "≥ 80 %",
-            interval(sum(c["reached"] >= 0.8 for c in reached), len(reached)),
+            interval(sum(reached), len(reached)),
         ),
         ("diagnoses that failed", "0", interval(sum(bool(c["error"]) for c in cases), len(cases))),
     ]

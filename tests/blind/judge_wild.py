@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from blind_judge import pipeline_for
 from wild_statistic import true_statistics
-from wild_truth import Truth, make, write
+from wild_truth import Truth, make
 
 from data_modules.readers import read_capture
 from nlos_lit.capture import Capture
@@ -24,7 +24,7 @@ from nlos_lit.inference.diagnose import diagnose, split_of
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.members import Findings
 from nlos_lit.inference.result import Diagnosis
-from nlos_lit.metrics.transients import poisson_deviance
+from nlos_lit.metrics.transients import transient_scores
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,8 @@ def reached(truth: Truth, capture: Capture, diagnosis: Diagnosis) -> float:
     The cause is taken from the simulator: by how much it changes each bin's light. It acts on a scene of
     counts without it, which has not bent to it, and is as far from the truth as other scenes are.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "capture.hdf5"
-        write(replace(truth, counts=np.random.default_rng([truth.spec.seed, 3]).poisson(truth.without)), path)
-        before = read_capture(path, "auto")
-    assert before.gate == capture.gate
+    drawn = np.random.default_rng([truth.spec.seed, 3]).poisson(truth.without).astype(capture.counts.dtype)
+    before = replace(capture, counts=drawn, observed=None)
     pipeline, split = pipeline_for(before), split_of(before)
     coarse = pipeline(before, split, 0)
     scenes = coarse, pipeline.grow(coarse, 0)
@@ -122,9 +119,11 @@ def reached(truth: Truth, capture: Capture, diagnosis: Diagnosis) -> float:
     change = torch.from_numpy((truth.expected / truth.without)[spots, first:last])
     with torch.no_grad():
         light = scene.model.expected(torch.from_numpy(spots), scene.extension).double() * change
-    known = poisson_deviance(torch.from_numpy(capture.gated_counts()[spots]).double(), light).mean()
+    counts, observed = torch.from_numpy(capture.gated_counts()[spots]), capture.gated_observed()
+    seen = None if observed is None else torch.from_numpy(observed[spots])
+    known = transient_scores(counts, light, seen).deviance_per_bin
     base, extended = (diagnosis.untouched_test[n].deviance_per_bin for n in ("base", "extended"))
-    return (base - extended) / (base - float(known))
+    return (base - extended) / (base - known)
 
 
 def said(diagnosis: Diagnosis, found: Findings) -> dict:

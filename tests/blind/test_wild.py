@@ -205,7 +205,7 @@ def test_geometry_by_hand():
     )
     work = work_on(scene)
     values = inject.gloss(work, 0.4)
-    tall, c = 1 / values["rough"] ** 2, half.min() ** -1 * DOT[2]
+    tall, c = 1 / values["rough"] ** 2, DOT[2] / half.min()
     brighter = (work.light.sum(axis=1) / scene.clean.sum(axis=1))[half.argmin()]
     # The registry's lobe, (p + 2)/2 cos^p, as bright at its middle and as wide: p = 2/m² - 2.
     assert brighter == pytest.approx(1 + values["strength"] * tall * c ** (2 * tall - 2), rel=1e-3)
