@@ -33,7 +33,11 @@ FREE_NAMES = (
 NAN = float("nan")
 TAIL = Accepted(
     "irf_tail",
-    {"fraction": Estimate(0.2113, 0.021, "1"), "decay": Estimate(0.117, 0.0062, "m")},
+    {
+        "fraction": Estimate(0.2113, 0.021, "1"),
+        "decay": Estimate(0.117, 0.0062, "m"),
+        "slow": Estimate(0.2113, 0.021, "1"),
+    },
     9123.0,
     Gain(1.2417, 1.1903, 0.01234, (0.0111, 0.0137)),
     {"afterpulsing": 0.19, "irf_tail": 0.81},
@@ -206,7 +210,11 @@ CASES = {
         effects=[
             Accepted(
                 "irf_tail",
-                {"fraction": Estimate(0.2, NAN, "1"), "decay": Estimate(NAN, NAN, "m")},
+                {
+                    "fraction": Estimate(0.2, NAN, "1"),
+                    "slow": Estimate(0.2, NAN, "1"),
+                    "decay": Estimate(NAN, NAN, "m"),
+                },
                 NAN,
                 Gain(NAN, NAN, NAN, (NAN, NAN)),
             )

@@ -9,18 +9,21 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
-from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.irf_tail import quicker_part
+from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import convolve, geometric
+from nlos_lit.functional.delays import convolve, geometric, two_decays
 
 
 class Afterpulsing(Effect):
     """Carriers trapped during an avalanche are released later and count again.
 
-    ``m'_t = m_t + probability · Σ_{s<t} m_s p_{t-s}``, ``p_k ∝ e^{-k/τ}``, ``Σ_k p_k = 1``; only counts of
-    this record matter.
+    ``m'_t = m_t + probability · Σ_{s<t} m_s p_{t-s}``, ``Σ_k p_k = 1``, ``p_k`` a sum of ``e^{-k/τ}`` of
+    one or two kinds of traps; only counts of this record matter.
 
-    Parameters: ``probability`` (1), null 0. ``decay`` τ (m of path), scanned.
+    Parameters: ``probability`` (1), null 0. ``decay`` τ (m of path), scanned. ``quick`` q (1): share of those
+    of quicker traps, fitted along from 0 on; those of the others, ``slow``, are reported, too.
+    ``quick_decay`` τ₂ (m of path).
 
     Signature: excess behind every strong return, as with ``irf_tail``, and energy is gained; the background
     rises along the record.
@@ -37,7 +40,7 @@ class Afterpulsing(Effect):
         phrase="afterpulsing (counts that trigger further counts)",
         cause="Carriers trapped in the detector are released later and are counted again.",
         remedy="Lengthen the hold-off time, lower the excess bias, or warm the detector a little.",
-        headline="{probability} of the counts, τ = {decay}",
+        headline="{slow} of the counts, τ = {decay}",
     )
     split_by: ClassVar = {
         "irf_tail": "a dark or ambient-only record: afterpulses follow background counts, a slow tail does "
@@ -53,6 +56,7 @@ class Afterpulsing(Effect):
         return (
             Parameter("probability", "1", 0.0, 0.05, 0.0, 0.9, kind="percent"),
             Parameter("decay", "m", None, 0.2, bins, 4 * bins * scan.n_bins, grid=decays, log=True),
+            *quicker_part(scan),
         )
 
     @classmethod
@@ -60,8 +64,13 @@ class Afterpulsing(Effect):
         return {"probability": 0.1}
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
-        rate = self.scan.bin_length / self.value("decay")
-        later = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
-        # Never in the same bin; the sum over all later bins is 1.
-        kernel = torch.where(later > 0, torch.expm1(rate) * torch.exp(-later * rate), 0.0)
+        edges = self.scan.bin_length * torch.arange(
+            expected.shape[1], dtype=expected.dtype, device=expected.device
+        )
+        late = two_decays(edges, *map(self.value, ("decay", "quick_decay", "quick")))
+        kernel = torch.nn.functional.pad(late, (1, 0))  # never in the same bin
         return expected + self.value("probability") * convolve(expected, kernel)
+
+    def quantities(self) -> dict[str, Quantity]:
+        slow = self.value("probability") * (1 - self.value("quick"))
+        return super().quantities() | {"slow": Quantity(slow, "1", kind="percent")}

@@ -7,17 +7,19 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
-from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import convolve, geometric, whole_record
+from nlos_lit.functional.delays import convolve, geometric, two_decays, whole_record
 
 
 class IrfTail(Effect):
-    """A share of the photons is counted late, by an exponentially distributed delay.
+    """A share of the photons is counted late, by delays of one or two exponential distributions.
 
-    ``Ψ' = (1 - f) Ψ + f · Ψ * (e^{-t/τ}/τ)``
+    ``Ψ' = (1 - f) Ψ + f · Ψ * ((1 - q) e^{-t/τ}/τ + q e^{-t/τ₂}/τ₂)``
 
-    Parameters: ``fraction`` f (1), null 0. ``decay`` τ (m of path), scanned.
+    Parameters: ``fraction`` f (1), null 0. ``decay`` τ (m of path), scanned. ``quick`` q (1): share of them
+    that decays more quickly, fitted along from 0 on. ``quick_decay`` τ₂ (m of path). What is left, ``slow``,
+    is reported, too: its error is smaller, since a scene can imitate what is quick.
 
     Signature: residuals above 0 for tens of bins after every strong return, at every spot alike; energy is
     conserved.
@@ -36,7 +38,7 @@ class IrfTail(Effect):
         cause="In a silicon SPAD some carriers are born outside the junction and diffuse into it late.",
         remedy="Measure the instrument response on the direct pulse and use it; a thinner detector or a "
         "shorter wavelength has less tail.",
-        headline="{fraction} of the photons, τ = {decay}",
+        headline="{slow} of the photons, τ = {decay}",
     )
     witness = "tail"
     imitated = "light"
@@ -48,6 +50,7 @@ class IrfTail(Effect):
         return (
             Parameter("fraction", "1", 0.0, 0.05, 0.0, 0.9, kind="percent"),
             Parameter("decay", "m", None, 0.2, bins, bins * scan.n_bins, grid=decays, log=True),
+            *quicker_part(scan),
         )
 
     @classmethod
@@ -56,8 +59,23 @@ class IrfTail(Effect):
 
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
-        steps = torch.arange(len(kernel) + 1, dtype=kernel.dtype, device=kernel.device)
-        share = steps * (self.scan.bin_length / self.value("decay"))
-        late = torch.exp(-share[:-1]) - torch.exp(-share[1:])
+        edges = self.scan.bin_length * torch.arange(len(kernel) + 1, dtype=kernel.dtype, device=kernel.device)
+        late = two_decays(edges, *map(self.value, ("decay", "quick_decay", "quick")))
         fraction = self.value("fraction")
         return (1 - fraction) * kernel + fraction * convolve(kernel, late)
+
+    def quantities(self) -> dict[str, Quantity]:
+        slow = self.value("fraction") * (1 - self.value("quick"))
+        return super().quantities() | {"slow": Quantity(slow, "1", kind="percent")}
+
+
+def quicker_part(scan: Scan) -> tuple[Parameter, ...]:
+    """Shapes of delays that decay in two parts: how many are quick, and how quickly they decay.
+
+    What decays within four bins is the response's.
+    """
+    bins = scan.bin_length
+    return (
+        Parameter("quick", "1", None, 0.1, 0.0, 0.9, grid=(0.0,), kind="percent"),
+        Parameter("quick_decay", "m", None, 0.2, 4 * bins, 16 * bins, grid=(6 * bins,), log=True),
+    )

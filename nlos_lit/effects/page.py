@@ -41,7 +41,7 @@ def numbers(effect: type[Effect]) -> str:
 
     Examples:
         >>> numbers(EFFECTS.named("irf_tail"))
-        '`fraction` f (1); `decay` τ (m) scanned'
+        '`fraction` f (1); `decay` τ (m) scanned; `quick` q (1); `quick_decay` τ₂ (m); slow'
         >>> numbers(EFFECTS.named("wall_reflectance"))
         '`gain_map` (1) 143 coefficients; rms'
     """

@@ -93,9 +93,10 @@ class Uncertainty:
 
 
 def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
-    """Quantities with all stored values moved by ``step``, without regard to bounds."""
+    """Quantities with all stored values moved by ``step``, as far as their bounds allow."""
     moved = copy.deepcopy(effect)
     moved.shift(step, shapes=True)
+    moved.clamp()
     return _values(moved)
 
 

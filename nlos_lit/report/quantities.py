@@ -230,7 +230,7 @@ def headline(effect: str, parameters: Mapping[str, Estimate]) -> str:
         The effect's own sentence; parameter by parameter where that does not fit them.
 
     Examples:
-        >>> headline("irf_tail", {"fraction": Estimate(0.2, 0.02, "1"), "decay": Estimate(0.117, 0.006, "m")})
+        >>> headline("irf_tail", {"slow": Estimate(0.2, 0.02, "1"), "decay": Estimate(0.117, 0.006, "m")})
         '20 ± 2 % of the photons, τ = 0.39 ns'
     """
     known = describe(effect)

@@ -37,6 +37,27 @@ def test_irf_tail_keeps_the_energy_and_delays_it():
     assert late[:5].abs().max().item() < 1e-6
 
 
+def test_late_photons_decay_in_two_parts():
+    """Of 0.3 a quarter decays over 4 bins; afterpulses of two kinds of traps alike, but a bin later."""
+    scan = dataclasses.replace(scene("confocal")[1], n_bins=4000)
+    values = {"decay": 10 * BIN, "quick": 0.25, "quick_decay": 4 * BIN}
+    tail = effect("irf_tail", scan=scan, fraction=0.3, **values)
+    kernel = torch.zeros(30)
+    kernel[5] = 1.0
+    late = tail.response(kernel, 5).detach()
+    parts = 0.75 * (math.exp(-2) - math.exp(-2.1)), 0.25 * (math.exp(-5) - math.exp(-5.25))
+    assert late[25].item() == pytest.approx(0.3 * sum(parts), abs=1e-6)
+    assert late.sum().item() == pytest.approx(1, abs=1e-5)
+    assert tail.quantities()["slow"].value.item() == pytest.approx(0.225)
+    after = effect("afterpulsing", scan=scan, probability=0.3, **values)
+    counts = torch.zeros(1, 4000)
+    counts[0, 5] = 1.0
+    seen = after.counting(counts, SPOT)[0].detach()
+    assert seen[26].item() == pytest.approx(0.3 * sum(parts), abs=1e-6)
+    assert seen.sum().item() == pytest.approx(1.3, abs=1e-5)
+    assert after.quantities()["slow"].value.item() == pytest.approx(0.225)
+
+
 def test_echoes_stand_at_their_delays():
     """Each at a multiple of the delay, and less by the same share; what comes after the record is cut."""
     kernel = torch.zeros(6)

@@ -86,6 +86,21 @@ def test_the_length_of_a_vector_is_unsure_where_its_largest_component_is():
     assert found.stderr == pytest.approx(scale * ((45**0.5 - 3) ** 2 / 9 + 0.01) ** 0.5, rel=1e-3)
 
 
+def test_what_is_quick_makes_the_whole_unsure_and_not_the_rest():
+    """A tail of 0.1, of which 0.2 ± 0.05 are quick, and the more the larger it is, so that 0.08 are slow;
+    how quickly they decay is not known at all, which is no more than their bounds allow.
+    """
+    tail = effect_of("irf_tail", SCAN, fraction=0.1, quick=0.2)
+    whole, quick, late = (tail.declared[name] for name in ("fraction", "quick", "quick_decay"))
+    together = torch.tensor([0.1 * 0.05 / 0.8 / whole.scale, 0.0, 0.05 / quick.scale, 0.0])
+    covariance = together[:, None] * together + torch.diag(torch.tensor([1e-12, 1e-6, 1e-12, 1e4]))
+    found = known([tail], covariance).parameters(tail)
+    assert found["fraction"].stderr == pytest.approx(0.1 * 0.05 / 0.8, rel=1e-3)
+    assert found["quick"].stderr == pytest.approx(0.05, rel=1e-3)
+    assert found["slow"].stderr < 0.2 * found["fraction"].stderr
+    assert found["quick_decay"].stderr == pytest.approx((late.upper - late.grid[0]) / 3, rel=1e-3)
+
+
 def test_a_parameter_that_comes_back_elsewhere_is_unsure():
     """Errors of 0.3 from the counts, and of 0.4 from a fit from new seeds."""
     slope, again = (effect_of("background_slope", SCAN, slope=value) for value in (0.2, -0.2))

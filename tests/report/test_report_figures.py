@@ -91,7 +91,7 @@ def test_deviance_without_each_term_and_of_the_untouched_spots():
 
 def test_intervals_are_95_percent_and_show_the_null():
     figure = plots.accepted_effects([TAIL], 0.0048)
-    fraction, decay = figure.axes
+    fraction, decay, _ = figure.axes
     segment = fraction.collections[0].get_segments()[0]
     assert segment[:, 0] == pytest.approx([21.13 - 1.96 * 2.1, 21.13 + 1.96 * 2.1])
     assert [line.get_xdata()[0] for line in fraction.lines if line.get_linestyle() == "--"] == [0.0]
