@@ -371,7 +371,7 @@ def test_a_scene_that_lies_aside_takes_up_a_wrong_baseline():
     assert again.projected < 0.5 * at_once.projected
 
 
-@pytest.mark.parametrize("name", ["time_offset", "clock_scale"])
+@pytest.mark.parametrize("name", ["time_offset", pytest.param("clock_scale", marks=pytest.mark.slow)])
 def test_a_scene_takes_up_what_moves_light_far(name):
     """By five bins or so: to the plates' own light no slope leads, to those of a moved scene it does."""
     truth = hide(Spec("plates", effects=(name,), strengths=(2,), level=2000, seed=6, side=SIDE))
@@ -380,6 +380,7 @@ def test_a_scene_takes_up_what_moves_light_far(name):
     assert again.projected < 0.05 * at_once.projected
 
 
+@pytest.mark.slow
 def test_a_scene_moves_by_half_a_baseline():
     truth = hide(Spec("letters", effects=("baseline_skewed",), strengths=(2,), level=2000, seed=6, side=SIDE))
     change = moved_scene(truth, "baseline_skewed", len(nuisances(truth, "baseline_skewed")))
@@ -391,7 +392,7 @@ def test_a_scene_moves_by_half_a_baseline():
     assert statistics.projected < 1e-3 * statistics.plain
 
 
-@pytest.mark.parametrize("name", ["wall_scratches", "jitter_heavy"])
+@pytest.mark.parametrize("name", [pytest.param("wall_scratches", marks=pytest.mark.slow), "jitter_heavy"])
 def test_no_scene_takes_up_what_single_spots_have(name):
     truth = hide(Spec("plates", effects=(name,), strengths=(2,), level=2000, seed=6, side=SIDE))
     at_once, again = (true_statistics(truth, steps)[name] for steps in (0, 8))
