@@ -118,7 +118,8 @@ def effect_of(name: str, scan: Scan, **values: float | Tensor) -> Effect:
 def uneven(effect: Effect) -> Effect:
     """Every amplitude a noticeable step and more off its null, no two alike; shapes beside their grid."""
     for p in effect.shapes:
-        effect.set(p.name, 1.013 * effect.value(p.name).detach())
+        value = float(effect.value(p.name).detach())
+        effect.set(p.name, 1.013 * value or 5 * p.scale)
     for p in effect.amplitudes:
         values = p.null + p.scale * torch.linspace(1.0, 1.5, p.size) * (1 if p.upper > p.null else -1)
         effect.set(p.name, values[0] if p.size == 1 else values)

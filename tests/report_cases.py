@@ -28,6 +28,7 @@ NAMES = (
 FREE_NAMES = (
     *("free_scan_delay", "free_wall_delay", "free_scan_background", "free_wall_background", "free_time"),
     *("free_wall", "free_lines", "free_scan", "free_rate", "free_response_scan", "free_response_wall"),
+    *("free_width_scan", "free_width_wall"),
     "free_spot_gain",
 )
 NAN = float("nan")

@@ -24,11 +24,11 @@ from nlos_lit.effects.free_terms import (
     RATES,
     Free,
     FreeRate,
-    FreeResponseScan,
     FreeScan,
     FreeScanBackground,
     FreeScanDelay,
     FreeTime,
+    FreeWidthScan,
 )
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
@@ -216,14 +216,14 @@ class Formula(Form, Effect):
         """
         raise NotImplementedError
 
-    def along(self, edges: Tensor) -> Tensor | None:
+    def along(self, edges: Tensor) -> Tensor:
         """Where places of the axis are.
 
         Args:
             edges: ``[…]`` as :class:`~nlos_lit.inference.result.Shape` has them.
 
         Returns:
-            ``[…]`` x; None where f is not what the free term's shape shows.
+            ``[…]`` x.
         """
         raise NotImplementedError
 
@@ -246,7 +246,7 @@ class _OverScan(Formula):
     def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.order[spots], free.values()[spots], torch.ones(len(spots))
 
-    def along(self, edges: Tensor) -> Tensor | None:
+    def along(self, edges: Tensor) -> Tensor:
         return edges / len(self.order)
 
 
@@ -283,18 +283,10 @@ class DelayOverScan(_OverScan):
 class WidthOverScan(_OverScan):
     """The response grows wider over the scan: a Gaussian whose variance is f, in squared bins."""
 
-    free, where = FreeResponseScan, "in the response's width over the course of the scan"
+    free, where = FreeWidthScan, "in the response's width over the course of the scan"
     acts = "signal → signal * N(0, f bins²)"
     size: ClassVar[tuple[str, float, float]] = ("1", 1.0, 100.0)
     one_way: ClassVar[bool] = True
-
-    def seen_in(self, free: Free, spots: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        # Its first kernel spreads light by a bin to either side: a variance of twice its coefficient.
-        assert isinstance(free, FreeResponseScan)
-        return self.order[spots], 2 * free.weights(spots)[:, 0], torch.ones(len(spots))
-
-    def along(self, edges: Tensor) -> None:
-        return None
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         length = 2 * signal.shape[1]

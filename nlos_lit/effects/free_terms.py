@@ -29,12 +29,12 @@ TAILS = (4.0, 12.0, 36.0)  # bins
 RATES = (-2.0, 2.0)  # natural logarithm of a spot's counts over the scan's mean
 
 
-def _words(where: str, what: str) -> EffectWords:
+def _words(where: str, what: str, size: str = "{rms} rms") -> EffectWords:
     return EffectWords(
         phrase=f"something unknown {where}",
         cause=f"{what} No equation of the registry has this form.",
         remedy="Look at its shape in the residual; if it follows a formula, that is a new effect file.",
-        headline="{rms} rms",
+        headline=size,
     )
 
 
@@ -272,19 +272,19 @@ class FreeWallDelay(_FreeDelay):
 class _FreeResponse(FreeTerm):
     """``signal → signal + Σ_ij c_ij b_j(spot) K_i signal``: what response and spot do together.
 
-    K_0 widens (a second difference), K_1 … K_3 move light into tails that decay over 4, 12 and 36 bins; all
-    keep the energy. A scene changes what arrives at a spot in any way it likes, but never smears all of it.
+    K_1 … K_3 move light into tails that decay over 4, 12 and 36 bins and keep the energy. A scene changes
+    what arrives at a spot in any way it likes, but never smears all of it.
     """
 
     kernels: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
-        self.register_buffer("kernels", response_changes(scan.n_bins), persistent=False)
+        self.register_buffer("kernels", tails_of(scan.n_bins), persistent=False)
 
     @classmethod
     def size(cls, scan: Scan) -> int:
-        return (1 + len(TAILS)) * cls.basis(scan).shape[1]
+        return len(TAILS) * cls.basis(scan).shape[1]
 
     def factors(self, spots: Tensor) -> Tensor | None:
         """At the null only: changes of a changed response do not add up."""
@@ -294,7 +294,7 @@ class _FreeResponse(FreeTerm):
         return _EqualResponse(self.scan)
 
     def weights(self, spots: Tensor | slice = slice(None)) -> Tensor:
-        """``[B, 4]`` of the changes at spots."""
+        """``[B, 3]`` of the changes at spots."""
         return self.functions[spots] @ self.value("field").reshape(self.functions.shape[1], -1)
 
     def values(self) -> Tensor:
@@ -346,6 +346,83 @@ class FreeResponseWall(_FreeResponse):
         return over_wall(scan, 5)[0][:, :8]
 
 
+class _FreeWidth(FreeTerm):
+    """Light spreads over time by a variance f, in squared bins, which is not the same at all spots.
+
+    A spectrum is multiplied by ``e^{-f (1 - cos ω)}``, and by ``1 - f (1 - cos ω)`` where f is negative: the
+    energy is kept. Beside the tails of :class:`_FreeResponse` it has a prior of its own, as they do far more
+    to the light by each unit.
+    """
+
+    def factors(self, spots: Tensor) -> Tensor | None:
+        """At the null only, as of a changed response."""
+        return None if bool(self.value("field").any()) else self.functions[spots]
+
+    def alone(self) -> Effect:
+        return _EqualWidth(self.scan)
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        prior = cls.likely(scan, 4.0)
+        return (Parameter("field", "1", 0.0, 0.5, -100.0, 100.0, size=len(prior), prior=prior),)
+
+    def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
+        length = 2 * signal.shape[1]
+        wave = 2 * torch.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
+        spread = self.at(spots) * (1 - wave.cos())
+        blur = torch.where(spread > 0, torch.exp(-spread.clamp_min(0)), 1 - spread)
+        return torch.fft.irfft(torch.fft.rfft(signal, length) * blur, length)[:, : signal.shape[1]].clamp_min(
+            0
+        )
+
+
+class _EqualWidth(_FreeWidth):
+    """Light spreads everywhere alike."""
+
+    name, axis = "equal_width", "time"
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return torch.ones(scan.n_spots, 1)
+
+    def factors(self, spots: Tensor) -> None:
+        return None
+
+
+class FreeWidthScan(_FreeWidth):
+    """f any combination of 16 splines over the scan; each octave of frequencies is as likely."""
+
+    name, axis = "free_width_scan", "scan"
+    words = _words(
+        "in the width of the response over the course of the scan",
+        "The pulse or the detector's response grows wider or narrower.",
+        "{rms} squared bins rms",
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_scan(scan, 16)[0]
+
+    @classmethod
+    def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
+        return falling_prior(over_scan(scan, 16)[1], largest, 0.5)
+
+
+class FreeWidthWall(_FreeWidth):
+    """f any combination of the 8 smoothest functions of the wall point without a constant."""
+
+    name, axis = "free_width_wall", "wall"
+    words = _words(
+        "in the width of the response across the wall",
+        "The response is wider at one region of the wall.",
+        "{rms} squared bins rms",
+    )
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 5)[0][:, :8]
+
+
 class FreeSpotGain(Free):
     """``m → m e^{δ_s}``, ``δ_s ~ N(0, σ²)``, independent."""
 
@@ -374,20 +451,21 @@ class FreeSpotGain(Free):
         return {"rms": Quantity(self.value("field").new_tensor(self.width * p.scale), p.unit, kind=p.kind)}
 
 
-def response_changes(n_bins: int) -> Tensor:
-    """``[4, T, T]`` what widening and three tails add to light, see :class:`_FreeResponse`.
+def tails_of(n_bins: int) -> Tensor:
+    """``[3, T, T]`` what tails that decay over ``TAILS`` bins add to light, and take from it.
 
     Examples:
-        Light of one bin is spread to both sides, and its energy kept:
+        Of light of one bin a part comes later, and the energy is kept:
 
-        >>> response_changes(5)[0, :, 2]
-        tensor([ 0.,  1., -2.,  1.,  0.])
+        >>> tails_of(5)[0, :, 2].round(decimals=3)
+        tensor([ 0.0000,  0.0000, -0.7790,  0.1720,  0.1340])
     """
     late = (torch.arange(n_bins)[:, None] - torch.arange(n_bins)).float()
-    changes = [(late.abs() == 1).float() - 2 * (late == 0).float()]
-    for tail in TAILS:
-        decay = torch.exp(-late.clamp_min(0) / tail) * (late >= 0)
-        changes.append(decay * (1 - torch.exp(torch.tensor(-1 / tail))) - (late == 0).float())
+    changes = [
+        torch.exp(-late.clamp_min(0) / tail) * (late >= 0) * (1 - torch.exp(torch.tensor(-1 / tail)))
+        - (late == 0).float()
+        for tail in TAILS
+    ]
     return torch.stack(changes).to(torch.get_default_dtype())
 
 
@@ -408,6 +486,6 @@ def time_bands(scan: Scan, number: int) -> Tensor:
 
 FREE: tuple[type[Free], ...] = (
     FreeScanDelay, FreeWallDelay, FreeScanBackground, FreeWallBackground, FreeTime, FreeWall, FreeLines,
-    FreeScan, FreeRate, FreeResponseScan, FreeResponseWall, FreeSpotGain,
+    FreeScan, FreeRate, FreeResponseScan, FreeResponseWall, FreeWidthScan, FreeWidthWall, FreeSpotGain,
 )  # fmt: skip
 FREE_NAMES = frozenset(term.name for term in FREE)

@@ -128,7 +128,7 @@ def lay(formula: Formula, free: Free, spots: Tensor, expected: Tensor) -> tuple[
 
 
 @torch.no_grad()
-def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray | None:
+def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) -> np.ndarray:
     """A formula at places of an axis, as high as the free term that it follows.
 
     Args:
@@ -138,11 +138,8 @@ def laid_through(formula: Formula, free: Free, fit: SurfelFit, edges: Tensor) ->
         edges: ``[K]`` of the axis.
 
     Returns:
-        ``[K]``; None where the term shows something else.
+        ``[K]``.
     """
-    x = formula.along(edges)
-    if x is None:
-        return None
     at, values, weight = formula.seen_in(free, fit.train, fit.model.expected(fit.train, fit.extension))
     constant = (weight * (values - formula.f(at))).sum() / weight.sum()
-    return (formula.f(x) + constant).numpy()
+    return (formula.f(formula.along(edges)) + constant).numpy()

@@ -78,10 +78,10 @@ def test_names_are_those_of_nothing_else():
 def test_each_place_is_a_free_term_s_and_has_its_forms():
     found = {place.free.name: {each.form for each in formulas_of(place.free.name)} for place in PLACES}
     every = {form.form for form in FORMS}
-    assert found.pop("free_response_scan") == {"step", "decay", "power", "log"}, "a variance is not negative"
+    assert found.pop("free_width_scan") == {"step", "decay", "power", "log"}, "a variance is not negative"
     assert set(found) < FREE_NAMES
     assert all(forms == every for forms in found.values())
-    assert {place.free.axis for place in PLACES} == {"scan", "time×scan", "time", "rate"}
+    assert {place.free.axis for place in PLACES} == {"scan", "time", "rate"}
     assert formulas_of("free_wall") == formulas_of("timing_jitter") == []
 
 

@@ -46,7 +46,7 @@ ACCEPTED = {
     "gain and pile-up": {"vignetting": {"strength": 0.3}, "pile_up": {"detections": 0.5}},
     "falloff, tail and background": {
         "retroreflection": {"falloff": 3.2, "cosine": 0.7, "entrance": 0.5},
-        "irf_tail": {"fraction": 0.2, "decay": 0.15},
+        "irf_tail": {"fraction": 0.2, "decay": 0.15, "quick": 0.3},
         "background_slope": {"slope": 0.5},
     },
 }
@@ -201,7 +201,9 @@ def test_columns_of_effects_are_the_slope_of_the_render(name):
     assert amplitudes.shape[1] == sum(1 if effect.per_spot else p.size for p in effect.amplitudes)
 
 
-@pytest.mark.parametrize("name", [*DELAYS, "free_response_scan", "free_response_wall"])
+@pytest.mark.parametrize(
+    "name", [*DELAYS, "free_response_scan", "free_response_wall", "free_width_scan", "free_width_wall"]
+)
 @pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
 def test_columns_of_what_acts_alike_at_all_spots_are_worked_out_once(name, kind, monkeypatch):
     """The same as by differentiating each coefficient: at its null and, of delays, away from it, beside

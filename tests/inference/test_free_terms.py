@@ -13,7 +13,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, response_changes, time_bands
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, tails_of, time_bands
 from nlos_lit.effects.scan_pieces import bands
 from nlos_lit.inference import pool
 from nlos_lit.inference.pool import Candidate, screen
@@ -53,7 +53,9 @@ def test_the_null_changes_nothing_and_the_rest_does(term):
         precision = effect.precision()
         assert torch.all(precision > 0)
         if term.axis == "scan":  # k half waves: an octave of them has the same variance
-            assert (precision / precision[0])[:30].tolist() == pytest.approx(range(1, 31), rel=1e-3)
+            halves = range(1, min(30, len(precision) // 2) + 1)  # few splines do not follow the finest ones
+            found = (precision / precision[0])[: len(halves)]
+            assert found.tolist() == pytest.approx(halves, rel=1e-3)
         else:
             assert len(set(precision.tolist())) == 1, "every coefficient has the same prior deviation"
 
@@ -117,10 +119,9 @@ def test_delays_by_hand(name):
 
 
 def test_changes_of_the_response_by_hand():
-    """Widening takes 2 for each 1 to either side; a tail takes 1 and gives (1 - e^{-1/τ}) e^{-t/τ}."""
-    changes = response_changes(400)
-    assert changes[0, 198:203, 200].tolist() == [0, 1, -2, 1, 0]
-    for k, tail in enumerate(TAILS, 1):
+    """A tail takes 1 and gives (1 - e^{-1/τ}) e^{-t/τ}."""
+    changes = tails_of(400)
+    for k, tail in enumerate(TAILS):
         share = 1 - np.exp(-1 / tail)
         assert not changes[k, :200, 200].any()
         assert changes[k, 200:203, 200].tolist() == pytest.approx(
@@ -129,7 +130,7 @@ def test_changes_of_the_response_by_hand():
     assert changes[:, :, 10].sum(1).abs().max() < 1e-3, "energy is kept"
     signal = torch.zeros(256, 64)
     signal[:, 20] = 100.0
-    effect = with_one("free_response_scan", 1, 0.1)  # the first stretch, the shortest tail
+    effect = with_one("free_response_scan", 0, 0.1)  # the first stretch, the shortest tail
     found, mine = effect.gain(signal, SPOTS).detach(), SCAN.rank < -1 + 2 / 16
     share = 1 - np.exp(-1 / TAILS[0])
     for spots, size in ((mine, 10 * 15 / 16), (~mine, -10 / 16)):  # nothing is the same at all spots
@@ -139,6 +140,24 @@ def test_changes_of_the_response_by_hand():
         )
     assert effect.values().detach()[mine][0, GATE[0]] == pytest.approx(0.1 * 15 / 16 * (share - 1))
     assert effect.values().detach().mean(0).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("name", ["free_width_scan", "free_width_wall"])
+def test_widths_by_hand(name):
+    """A pulse gets wider by the variance f where f is positive, and keeps its energy and its place; where it
+    is negative, a pulse of 16 squared bins gets narrower by as much.
+    """
+    effect = with_one(name, 1, 1.0)
+    signal = 100 * torch.exp(-0.5 * (torch.arange(64) - 30.0) ** 2 / 16).expand(256, -1)
+    found, f = effect.gain(signal, SPOTS).detach().double(), effect.values().detach().double()
+    bins = torch.arange(64).double()
+    assert torch.allclose(found.sum(1), signal.sum(1).double(), rtol=1e-5)
+    middle = (found @ bins) / found.sum(1)
+    assert torch.allclose(middle, torch.full_like(middle, 30.0), atol=1e-3)
+    variance = (found * (bins - middle[:, None]) ** 2).sum(1) / found.sum(1)
+    assert float(f.min()) < -1
+    assert float(f.max()) > 1
+    assert torch.allclose(variance - 16, f, atol=0.02)
 
 
 def test_single_spots_by_hand():
@@ -182,6 +201,7 @@ def rough(name: str, size: float) -> Effect:
 
 SIZES = {"free_scan_delay": 0.2 * BIN, "free_wall_delay": 0.2 * BIN, "free_scan_background": 0.3}
 SIZES |= {"free_wall_background": 0.3, "free_response_scan": 0.01, "free_response_wall": 0.01}
+SIZES |= {"free_width_scan": 0.6, "free_width_wall": 0.6}
 
 
 @FORWARD_MODE
