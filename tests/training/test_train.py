@@ -147,7 +147,7 @@ def test_effects_are_refined_along_and_open_again(finished):
     refined = json.loads((finished / "summary.json").read_text())["refined"]
     effects = refined["effects"]
     assert list(effects) == ["irf_tail", "wall_reflectance"]
-    assert set(effects["irf_tail"]) == {"fraction", "decay"}
+    assert set(effects["irf_tail"]) == {"fraction", "decay", "quick", "quick_decay", "slow"}
     assert effects["irf_tail"]["decay"]["unit"] == "m"
     assert effects["wall_reflectance"]["rms"]["value"] > 0
     text = (finished / "train.log").read_text()
