@@ -78,6 +78,8 @@ SHAPES = {
     "free_wall": Shape("wall", "1", WALL, _bump(8, 6), np.linspace(-0.6, 0.6, 7)),
     "free_wall_delay": Shape("wall", "m", WALL, 0.02 * _bump(8, 8), WALL),
     "free_wall_background": Shape("wall", "1", WALL, _bump(8, 8), WALL),
+    "free_width_scan": Shape("scan", "bins²", np.linspace(0, 4096, 65), 4 * _bump(64)),
+    "free_width_wall": Shape("wall", "bins²", WALL, 4 * _bump(8, 8), WALL),
     "free_response_scan": Shape("time×scan", "1", GATE, _bump(16, 64), np.linspace(0, 4096, 65)),
     "free_response_wall": Shape("time×wall", "1", GATE, _bump(16, 8), WALL),
 }

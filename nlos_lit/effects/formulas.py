@@ -285,7 +285,7 @@ class WidthOverScan(_OverScan):
 
     free, where = FreeWidthScan, "in the response's width over the course of the scan"
     acts = "signal → signal * N(0, f bins²)"
-    size: ClassVar[tuple[str, float, float]] = ("1", 1.0, 100.0)
+    size: ClassVar[tuple[str, float, float]] = ("bins²", 1.0, 100.0)
     one_way: ClassVar[bool] = True
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:

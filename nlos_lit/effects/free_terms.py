@@ -29,12 +29,12 @@ TAILS = (4.0, 12.0, 36.0)  # bins
 RATES = (-2.0, 2.0)  # natural logarithm of a spot's counts over the scan's mean
 
 
-def _words(where: str, what: str, size: str = "{rms} rms") -> EffectWords:
+def _words(where: str, what: str) -> EffectWords:
     return EffectWords(
         phrase=f"something unknown {where}",
         cause=f"{what} No equation of the registry has this form.",
         remedy="Look at its shape in the residual; if it follows a formula, that is a new effect file.",
-        headline=size,
+        headline="{rms} rms",
     )
 
 
@@ -364,7 +364,7 @@ class _FreeWidth(FreeTerm):
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
         prior = cls.likely(scan, 4.0)
-        return (Parameter("field", "1", 0.0, 0.5, -100.0, 100.0, size=len(prior), prior=prior),)
+        return (Parameter("field", "bins²", 0.0, 0.5, -100.0, 100.0, size=len(prior), prior=prior),)
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
         length = 2 * signal.shape[1]
@@ -396,7 +396,6 @@ class FreeWidthScan(_FreeWidth):
     words = _words(
         "in the width of the response over the course of the scan",
         "The pulse or the detector's response grows wider or narrower.",
-        "{rms} squared bins rms",
     )
 
     @classmethod
@@ -415,7 +414,6 @@ class FreeWidthWall(_FreeWidth):
     words = _words(
         "in the width of the response across the wall",
         "The response is wider at one region of the wall.",
-        "{rms} squared bins rms",
     )
 
     @classmethod

@@ -14,7 +14,7 @@ class Number(NamedTuple):
     """How a number is said, whatever its value.
 
     Args:
-        unit: ``1``, ``m``, ``rad``, ``bins`` or ``counts/bin``.
+        unit: ``1``, ``m``, ``rad``, ``bins``, ``bins²`` or ``counts/bin``.
         kind: ``percent`` or ``plain`` (1), ``time`` (m of path) or ``length`` (m), ``angle`` (rad), ``bins``,
             ``counts``; empty: the usual one of the unit.
         null: value at which the effect is absent; None for a shape, which has none.

@@ -165,7 +165,7 @@ def residual_wall(profile: Profile, calm: bool = False) -> Figure:
 def free_shape(
     name: str, shape: Shape, bin_length: float | None = None, formula: Followed | None = None
 ) -> Figure:
-    """What a free term does along its axis, or over two: a change in percent, or a delay; no change at 0.
+    """What a free term does along its axis, or over two: a change in percent, a delay or a width, 0 for none.
 
     Args:
         name: of the term.
@@ -571,6 +571,8 @@ def _change(name: str, shape: Shape, bin_length: float | None) -> tuple[np.ndarr
     if shape.unit == "1":
         what = "background" if "background" in name else "counts"
         return 100 * np.expm1(shape.values), f"change of the {what} (%)"
+    if shape.unit == "bins²":
+        return shape.values, "change of the response's variance (bins²)"
     if bin_length:
         return shape.values / bin_length, f"delay (bins of {amount_of('length', bin_length)})"
     return 1e3 * shape.values, "delay (mm of path)"

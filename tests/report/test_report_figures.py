@@ -134,6 +134,14 @@ def test_a_delay_is_in_bins_where_they_are_known():
         assert axes.get_ylabel() == label
 
 
+def test_a_width_is_shown_in_squared_bins():
+    for bin_length in (0.0048, None):
+        (axes,) = plots.free_shape("free_width_scan", SHAPES["free_width_scan"], bin_length).axes
+        line = next(p for p in axes.patches if p.get_data().baseline is None)
+        np.testing.assert_allclose(line.get_data().values, SHAPES["free_width_scan"].values)
+        assert axes.get_ylabel() == "change of the response's variance (bins²)"
+
+
 def test_a_free_term_over_two_axes_is_an_image_around_0():
     values = np.log([[1.1, 1.0, 1.0], [1.0, 1.0, 0.8]])
     edges, edges_y = np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 2.0, 3.0])
