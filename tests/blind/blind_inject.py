@@ -162,7 +162,6 @@ def wall_reflectance(work: Work, rms: float) -> dict[str, float]:
 
 
 def vignetting(work: Work, strength: float) -> dict[str, float]:
-    strength = strength * float(work.rng.choice([1, 1, 1, -1]))
     work.gain = work.gain * np.exp(-strength * (work.scene.places**2).sum(axis=1))
     return {"strength": strength}
 
