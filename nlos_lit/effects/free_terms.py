@@ -371,9 +371,8 @@ class _FreeWidth(FreeTerm):
         wave = 2 * torch.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
         spread = self.at(spots) * (1 - wave.cos())
         blur = torch.where(spread > 0, torch.exp(-spread.clamp_min(0)), 1 - spread)
-        return torch.fft.irfft(torch.fft.rfft(signal, length) * blur, length)[:, : signal.shape[1]].clamp_min(
-            0
-        )
+        found = torch.fft.irfft(torch.fft.rfft(signal, length) * blur, length)
+        return found[:, : signal.shape[1]].clamp_min(0)
 
 
 class _EqualWidth(_FreeWidth):
