@@ -32,7 +32,7 @@ from nlos_lit.effects.free_terms import (
 )
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import geometric
+from nlos_lit.functional.delays import filtered, geometric
 from nlos_lit.functional.surfel_paths import Paths
 
 EDGE = 0.01  # of the axis: width of a step
@@ -289,10 +289,7 @@ class WidthOverScan(_OverScan):
     one_way: ClassVar[bool] = True
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        length = 2 * signal.shape[1]
-        wave = 2 * math.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
-        blur = torch.exp(-0.5 * self.at(spots) * wave**2)
-        return torch.fft.irfft(torch.fft.rfft(signal, length) * blur, length)[:, : signal.shape[1]]
+        return filtered(signal, lambda wave: torch.exp(-0.5 * self.at(spots) * wave**2))
 
 
 class CountsOverTime(Formula):

@@ -23,6 +23,7 @@ from nlos_lit.effects.scan_pieces import bands, stretches
 from nlos_lit.effects.smooth import falling_prior, fast, length, over_scan, over_wall
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
+from nlos_lit.functional.delays import filtered
 from nlos_lit.functional.surfel_paths import Paths
 
 TAILS = (4.0, 12.0, 36.0)  # bins
@@ -106,18 +107,23 @@ class FreeTerm(Free):
 
 
 class _AlongScan(FreeTerm):
-    """128 splines over the scan, or one for every four spots; each octave of frequencies is as likely."""
+    """Splines over the scan; each octave of frequencies is as likely."""
 
     axis = "scan"
 
     @classmethod
+    def splines(cls, scan: Scan) -> int:
+        """128, or one for every four spots."""
+        return fast(scan)
+
+    @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return over_scan(scan, fast(scan))[0]
+        return over_scan(scan, cls.splines(scan))[0]
 
     @classmethod
     def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
         # An octave has as many more functions as it has higher frequencies: variances fall as much.
-        return falling_prior(over_scan(scan, fast(scan))[1], largest, 0.5)
+        return falling_prior(over_scan(scan, cls.splines(scan))[1], largest, 0.5)
 
 
 class _FreeCounts(FreeTerm):
@@ -269,7 +275,36 @@ class FreeWallDelay(_FreeDelay):
         return over_wall(scan, 6)[0]
 
 
-class _FreeResponse(FreeTerm):
+class _OfResponse(FreeTerm):
+    """What becomes of all light at a spot, by functions of the spot."""
+
+    def factors(self, spots: Tensor) -> Tensor | None:
+        """At the null only: changes of a changed response do not add up."""
+        return None if bool(self.value("field").any()) else self.functions[spots]
+
+
+class _Equally(_OfResponse):
+    """The same at all spots."""
+
+    axis = "time"
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return torch.ones(scan.n_spots, 1)
+
+    def factors(self, spots: Tensor) -> None:
+        return None
+
+
+class _OverWall(_OfResponse):
+    """The 8 smoothest functions of the wall point without a constant."""
+
+    @classmethod
+    def basis(cls, scan: Scan) -> Tensor:
+        return over_wall(scan, 5)[0][:, :8]
+
+
+class _FreeResponse(_OfResponse):
     """``signal → signal + Σ_ij c_ij b_j(spot) K_i signal``: what response and spot do together.
 
     K_1 … K_3 move light into tails that decay over 4, 12 and 36 bins and keep the energy. A scene changes
@@ -285,10 +320,6 @@ class _FreeResponse(FreeTerm):
     @classmethod
     def size(cls, scan: Scan) -> int:
         return len(TAILS) * cls.basis(scan).shape[1]
-
-    def factors(self, spots: Tensor) -> Tensor | None:
-        """At the null only: changes of a changed response do not add up."""
-        return None if bool(self.value("field").any()) else self.functions[spots]
 
     def alone(self) -> Effect:
         return _EqualResponse(self.scan)
@@ -307,17 +338,10 @@ class _FreeResponse(FreeTerm):
         return (signal + torch.einsum("bk,bkt->bt", weights, changed)).clamp_min(0)
 
 
-class _EqualResponse(_FreeResponse):
+class _EqualResponse(_Equally, _FreeResponse):
     """The response changes everywhere alike."""
 
-    name, axis = "equal_response", "time"
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return torch.ones(scan.n_spots, 1)
-
-    def factors(self, spots: Tensor) -> None:
-        return None
+    name = "equal_response"
 
 
 class FreeResponseScan(_FreeResponse):
@@ -335,28 +359,20 @@ class FreeResponseScan(_FreeResponse):
         return found - found.mean(0)
 
 
-class FreeResponseWall(_FreeResponse):
+class FreeResponseWall(_OverWall, _FreeResponse):
     """The response depends on the wall point: b_j the 8 smoothest functions of it without a constant."""
 
     name, axis = "free_response_wall", "time×wall"
     words = _words("along time that depends on the wall point", "The response is not the same everywhere.")
 
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_wall(scan, 5)[0][:, :8]
 
-
-class _FreeWidth(FreeTerm):
+class _FreeWidth(_OfResponse):
     """Light spreads over time by a variance f, in squared bins, which is not the same at all spots.
 
     A spectrum is multiplied by ``e^{-f (1 - cos ω)}``, and by ``1 - f (1 - cos ω)`` where f is negative: the
     energy is kept. Beside the tails of :class:`_FreeResponse` it has a prior of its own, as they do far more
     to the light by each unit.
     """
-
-    def factors(self, spots: Tensor) -> Tensor | None:
-        """At the null only, as of a changed response."""
-        return None if bool(self.value("field").any()) else self.functions[spots]
 
     def alone(self) -> Effect:
         return _EqualWidth(self.scan)
@@ -367,46 +383,34 @@ class _FreeWidth(FreeTerm):
         return (Parameter("field", "bins²", 0.0, 0.5, -100.0, 100.0, size=len(prior), prior=prior),)
 
     def gain(self, signal: Tensor, spots: Tensor) -> Tensor:
-        length = 2 * signal.shape[1]
-        wave = 2 * torch.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
-        spread = self.at(spots) * (1 - wave.cos())
-        blur = torch.where(spread > 0, torch.exp(-spread.clamp_min(0)), 1 - spread)
-        found = torch.fft.irfft(torch.fft.rfft(signal, length) * blur, length)
-        return found[:, : signal.shape[1]].clamp_min(0)
+        def blur(wave: Tensor) -> Tensor:
+            spread = self.at(spots) * (1 - wave.cos())
+            return torch.where(spread > 0, torch.exp(-spread.clamp_min(0)), 1 - spread)
+
+        return filtered(signal, blur).clamp_min(0)
 
 
-class _EqualWidth(_FreeWidth):
+class _EqualWidth(_Equally, _FreeWidth):
     """Light spreads everywhere alike."""
 
-    name, axis = "equal_width", "time"
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return torch.ones(scan.n_spots, 1)
-
-    def factors(self, spots: Tensor) -> None:
-        return None
+    name = "equal_width"
 
 
-class FreeWidthScan(_FreeWidth):
+class FreeWidthScan(_AlongScan, _FreeWidth):
     """f any combination of 16 splines over the scan; each octave of frequencies is as likely."""
 
-    name, axis = "free_width_scan", "scan"
+    name = "free_width_scan"
     words = _words(
         "in the width of the response over the course of the scan",
         "The pulse or the detector's response grows wider or narrower.",
     )
 
     @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_scan(scan, 16)[0]
-
-    @classmethod
-    def likely(cls, scan: Scan, largest: float) -> tuple[float, ...]:
-        return falling_prior(over_scan(scan, 16)[1], largest, 0.5)
+    def splines(cls, scan: Scan) -> int:
+        return 16
 
 
-class FreeWidthWall(_FreeWidth):
+class FreeWidthWall(_OverWall, _FreeWidth):
     """f any combination of the 8 smoothest functions of the wall point without a constant."""
 
     name, axis = "free_width_wall", "wall"
@@ -414,10 +418,6 @@ class FreeWidthWall(_FreeWidth):
         "in the width of the response across the wall",
         "The response is wider at one region of the wall.",
     )
-
-    @classmethod
-    def basis(cls, scan: Scan) -> Tensor:
-        return over_wall(scan, 5)[0][:, :8]
 
 
 class FreeSpotGain(Free):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -62,6 +64,26 @@ def convolve(values: Tensor, kernel: Tensor) -> Tensor:
     return torch.fft.irfft(torch.fft.rfft(values, size) * torch.fft.rfft(kernel, size), size)[
         ..., : values.shape[-1]
     ]
+
+
+def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
+    """Light whose spectrum over time is multiplied; nothing comes round from the end.
+
+    Args:
+        signal: ``[B, T]``.
+        response: what angular frequencies ``[F]`` (rad per bin) are multiplied by, ``[F]`` or ``[B, F]``.
+
+    Returns:
+        ``[B, T]``.
+
+    Examples:
+        >>> filtered(torch.tensor([[0.0, 4.0, 0.0]]), lambda wave: 1 - (1 - wave.cos()) / 2).round(decimals=3)
+        tensor([[1., 2., 1.]])
+    """
+    length = 2 * signal.shape[1]
+    wave = 2 * torch.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
+    found = torch.fft.irfft(torch.fft.rfft(signal, length) * response(wave), length)
+    return found[:, : signal.shape[1]]
 
 
 def two_decays(edges: Tensor, decay: Tensor, quick_decay: Tensor, quick: Tensor) -> Tensor:
