@@ -9,10 +9,10 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
-from nlos_lit.effects.irf_tail import quicker_part
 from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.two_parts import quicker_part, share_left
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import convolve, geometric, two_decays
+from nlos_lit.functional.delays import convolve, geometric
 
 
 class Afterpulsing(Effect):
@@ -67,7 +67,7 @@ class Afterpulsing(Effect):
         edges = self.scan.bin_length * torch.arange(
             expected.shape[1], dtype=expected.dtype, device=expected.device
         )
-        late = two_decays(edges, *map(self.value, ("decay", "quick_decay", "quick")))
+        late = -share_left(self, edges).diff()
         kernel = torch.nn.functional.pad(late, (1, 0))  # never in the same bin
         return expected + self.value("probability") * convolve(expected, kernel)
 

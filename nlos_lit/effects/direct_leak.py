@@ -8,6 +8,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.two_parts import quicker_part, share_left
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import geometric
 
@@ -15,10 +16,12 @@ from nlos_lit.functional.delays import geometric
 class DirectLeak(Effect):
     """The tail of the first bounce reaches into the gate, the same at every spot.
 
-    ``background → background + amplitude e^{-(t - first)/τ}``, t the bin number, first that of the gate;
-    constant before the gate.
+    ``background → background + amplitude ((1 - q) e^{-(t - first)/τ} + q e^{-(t - first)/τ₂})``, t the bin
+    number, first that of the gate; constant before the gate.
 
     Parameters: ``amplitude`` (counts/bin, in the gate's first bin), null 0. ``decay`` τ (m of path), scanned.
+    ``quick`` q (1): share of the amplitude that decays more quickly, fitted along from 0 on. ``quick_decay``
+    τ₂ (m of path).
 
     Signature: residual above 0 at the start of the gate, equal at all spots however far the scene is from
     them.
@@ -56,6 +59,7 @@ class DirectLeak(Effect):
                 grid=geometric(3 * bins, bins * width, 8),
                 log=True,
             ),
+            *quicker_part(scan),
         )
 
     @classmethod
@@ -65,6 +69,4 @@ class DirectLeak(Effect):
     def background(self, background: Tensor, spots: Tensor) -> Tensor:
         first, last = self.scan.gate
         since = (torch.arange(last, dtype=background.dtype, device=background.device) - first).clamp_min(0)
-        return background + self.value("amplitude") * torch.exp(
-            -since * self.scan.bin_length / self.value("decay")
-        )
+        return background + self.value("amplitude") * share_left(self, since * self.scan.bin_length)

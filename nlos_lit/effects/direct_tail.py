@@ -10,6 +10,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.two_parts import quicker_part, share_left
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import geometric
 
@@ -17,14 +18,15 @@ from nlos_lit.functional.delays import geometric
 class DirectTail(Effect):
     """The tail of the first bounce reaches into the gate; the nearer the laser's point, the stronger.
 
-    ``background → background + amplitude · (reach/(reach + d))² · e^{-(t - d - t0)/τ}`` from the direct
-    light's arrival d on, d the distance of the laser's point from the sensor's on the wall (its path between
-    them), t the path at the bin's middle, t0 the least t - d of the gate's bins and the scan's spots (0 if
-    that is below it); constant where t - d < t0.
+    ``background → background + amplitude · (reach/(reach + d))² · ((1 - q) e^{-u/τ} + q e^{-u/τ₂})``,
+    ``u = t - d - t0``, from the direct light's arrival d on, d the distance of the laser's point from the
+    sensor's on the wall (its path between them), t the path at the bin's middle, t0 the least t - d of the
+    gate's bins and the scan's spots (0 if that is below it); constant where t - d < t0.
 
     Parameters: ``amplitude`` (counts/bin), where t - d = t0, before the falloff, null 0. ``decay`` τ (m of
-    path) and ``reach`` (m on the wall), scanned. Quantity ``strongest`` (counts/bin): the most that any spot
-    has in the gate's first bin.
+    path) and ``reach`` (m on the wall), scanned. ``quick`` q (1): share that decays more quickly, fitted
+    along from 0 on. ``quick_decay`` τ₂ (m of path). Quantity ``strongest`` (counts/bin): the most that any
+    spot has in the gate's first bin.
 
     Signature: residual above 0 at the start of the gate, the more so the nearer the sensor's point is to the
     laser's, in rings about the point of a laser that stands still.
@@ -77,6 +79,7 @@ class DirectTail(Effect):
             Parameter("amplitude", "counts/bin", 0.0, scan.background, 0.0, most),
             Parameter("decay", "m", None, 0.2, bins, longest, grid=decays, log=True),
             Parameter("reach", "m", None, 0.3, half / 50, 50 * half, grid=reaches, log=True, kind="length"),
+            *quicker_part(scan),
         )
 
     @classmethod
@@ -106,9 +109,9 @@ class DirectTail(Effect):
         opens = scan.t_start + (scan.gate[0] + 0.5) * scan.bin_length
         start = (opens - self.distance.max()).clamp_min(0)
         since = path - distance[:, None]
-        decayed = torch.exp(-(since - start).clamp_min(0) / self.value("decay")) * (since >= 0)
+        left = share_left(self, (since - start).clamp_min(0)) * (since >= 0)
         reach = self.value("reach")
-        return self.value("amplitude") * (reach / (reach + distance[:, None])) ** 2 * decayed
+        return self.value("amplitude") * (reach / (reach + distance[:, None])) ** 2 * left
 
     def quantities(self) -> dict[str, Quantity]:
         opens = self.distance.new_tensor(

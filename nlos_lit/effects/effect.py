@@ -165,6 +165,14 @@ class Effect(nn.Module, Hooks):
             getattr(self, f"raw_{p.name}").add_(step[: p.size])
             step = step[p.size :]
 
+    def is_meant(self, step: Tensor) -> bool:
+        """Whether the effect is still what its name says.
+
+        Args:
+            step: ``[k]`` of its stored amplitudes from their nulls.
+        """
+        return True
+
     def factors(self, spots: Tensor) -> Tensor | None:
         """``[B, J]`` where amplitudes act as those of :meth:`alone` do, times a number at each spot.
 

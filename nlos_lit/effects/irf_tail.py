@@ -8,8 +8,9 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
+from nlos_lit.effects.two_parts import quicker_part, share_left
 from nlos_lit.effects.words import EffectWords
-from nlos_lit.functional.delays import convolve, geometric, two_decays, whole_record
+from nlos_lit.functional.delays import convolve, geometric, whole_record
 
 
 class IrfTail(Effect):
@@ -60,22 +61,10 @@ class IrfTail(Effect):
     def response(self, kernel: Tensor, lead: int) -> Tensor:
         kernel = whole_record(kernel, lead, self.scan.n_bins)
         edges = self.scan.bin_length * torch.arange(len(kernel) + 1, dtype=kernel.dtype, device=kernel.device)
-        late = two_decays(edges, *map(self.value, ("decay", "quick_decay", "quick")))
+        late = -share_left(self, edges).diff()
         fraction = self.value("fraction")
         return (1 - fraction) * kernel + fraction * convolve(kernel, late)
 
     def quantities(self) -> dict[str, Quantity]:
         slow = self.value("fraction") * (1 - self.value("quick"))
         return super().quantities() | {"slow": Quantity(slow, "1", kind="percent")}
-
-
-def quicker_part(scan: Scan) -> tuple[Parameter, ...]:
-    """Shapes of delays that decay in two parts: how many are quick, and how quickly they decay.
-
-    What decays within four bins is the response's.
-    """
-    bins = scan.bin_length
-    return (
-        Parameter("quick", "1", None, 0.1, 0.0, 0.9, grid=(0.0,), kind="percent"),
-        Parameter("quick_decay", "m", None, 0.2, 4 * bins, 16 * bins, grid=(6 * bins,), log=True),
-    )

@@ -9,20 +9,22 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.parameter import Parameter
-from nlos_lit.effects.smooth import SLOW, SmoothEffect, over_scan
+from nlos_lit.effects.smooth import SmoothEffect, fast, over_scan
 from nlos_lit.effects.words import EffectWords
 
 
 class PowerDrift(SmoothEffect):
     """The laser gets stronger or weaker, or the detector's efficiency drifts.
 
-    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline of 24 functions
-    without its constant.
+    ``signal → signal · e^{f(u)}``, u the order of acquisition from -1 to 1, f a cubic spline without its
+    constant, of 128 functions (of one for every four spots where they are few), likely a random walk: its
+    coefficients fall with the frequency.
 
-    Parameters: ``drift`` (1, logarithm of the gain), 23 coefficients, null 0. Quantities ``rms`` and
+    Parameters: ``drift`` (1, logarithm of the gain), at most 127 coefficients, null 0. Quantities ``rms`` and
     ``peak_to_peak`` (1).
 
-    Signature: spot totals follow the order of acquisition; the shape in time is right.
+    Signature: spot totals follow the order of acquisition; the shape in time is right. A power that swings
+    more than 12 times during the scan, in the mean of its squares, is no drift.
 
     Degenerate with: ``wall_reflectance`` in a raster scan, which can be any smooth function of the slow axis;
     normals of a small scene.
@@ -46,10 +48,11 @@ class PowerDrift(SmoothEffect):
     coefficients = "drift"
     falling: ClassVar[float] = 1.0
     ends: ClassVar[bool] = True
+    slow: ClassVar[bool] = True
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
-        return over_scan(scan, SLOW)
+        return over_scan(scan, fast(scan))
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

@@ -31,16 +31,21 @@ class SmoothEffect(Effect):
         coefficients: name of the parameter.
         falling: the power; 3 is Sobolev smoothness 2 over a plane, 1 a random walk along a line.
         ends: whether the peak-to-peak value is reported, too.
+        slow: it drifts: what swings, in the mean, more often over the scan than ``SLOW`` splines can is
+            something else.
     """
 
     coefficients: ClassVar[str]
     falling: ClassVar[float] = 3.0
     ends: ClassVar[bool] = False
+    slow: ClassVar[bool] = False
     functions: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
-        self.register_buffer("functions", self.basis(scan)[0], persistent=False)
+        functions, share = self.basis(scan)
+        self.register_buffer("functions", functions, persistent=False)
+        self.frequency = share.rsqrt()  # of each, in half periods over the scan
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
@@ -74,6 +79,10 @@ class SmoothEffect(Effect):
         """``[B]`` f at ``spots`` ``[B]``, or ``[S]`` at all of them."""
         functions = self.functions if spots is None else self.functions[spots]
         return functions @ self.value(self.coefficients).reshape(-1)
+
+    def is_meant(self, step: Tensor) -> bool:
+        power = step.cpu().square()
+        return not self.slow or bool((power * self.frequency).sum() <= SLOW * power.sum())
 
     def quantities(self) -> dict[str, Quantity]:
         p, field = self.declared[self.coefficients], self.field()

@@ -25,7 +25,8 @@ class TimeDrift(SmoothEffect):
     Parameters: ``drift`` (m of path), at most 127 coefficients, null 0. Quantities ``rms`` and
     ``peak_to_peak`` (m).
 
-    Signature: residuals of both signs at every edge in time, their sign changing along the scan.
+    Signature: residuals of both signs at every edge in time, their sign changing along the scan. A delay that
+    swings more than 12 times during the scan, in the mean of its squares, is no drift.
 
     Degenerate with: ``wall_tilt`` in a raster scan (slow axis = scan order); a serpentine scan or columns
     split nothing more.
@@ -48,6 +49,7 @@ class TimeDrift(SmoothEffect):
     coefficients = "drift"
     falling: ClassVar[float] = 1.0
     ends: ClassVar[bool] = True
+    slow: ClassVar[bool] = True
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

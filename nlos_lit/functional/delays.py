@@ -84,25 +84,3 @@ def filtered(signal: Tensor, response: Callable[[Tensor], Tensor]) -> Tensor:
     wave = 2 * torch.pi * torch.fft.rfftfreq(length, device=signal.device).to(signal)
     found = torch.fft.irfft(torch.fft.rfft(signal, length) * response(wave), length)
     return found[:, : signal.shape[1]]
-
-
-def two_decays(edges: Tensor, decay: Tensor, quick_decay: Tensor, quick: Tensor) -> Tensor:
-    """Shares of exponential delays, of which some decay more quickly, in every bin.
-
-    Args:
-        edges: ``[K + 1]`` of the bins.
-        decay, quick_decay: mean delays, in the unit of the edges.
-        quick: share of those that decay more quickly.
-
-    Returns:
-        ``[K]``, together 1 less what is later than the last edge.
-
-    Examples:
-        >>> one, half = torch.tensor(1.0), torch.tensor(0.5)
-        >>> two_decays(torch.tensor([0.0, 1.0, 50.0]), one, half, torch.tensor(0.0)).round(decimals=3)
-        tensor([0.6320, 0.3680])
-        >>> two_decays(torch.tensor([0.0, 1.0, 50.0]), one, half, half).round(decimals=3)
-        tensor([0.7480, 0.2520])
-    """
-    later = (1 - quick) * torch.exp(-edges / decay) + quick * torch.exp(-edges / quick_decay)
-    return later[:-1] - later[1:]

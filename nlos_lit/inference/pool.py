@@ -541,7 +541,8 @@ def _evidence(
     problem: Problem, projector: Projector, effect: Effect, columns: Tensor, freed: Freed, block: Tensor
 ) -> Evidence:
     raw = columns.reshape(*problem.expected.shape, -1)
-    return best_evidence(projector, raw, freed, block, prior_deviations(effect), step_bounds(effect))
+    found = best_evidence(projector, raw, freed, block, prior_deviations(effect), step_bounds(effect))
+    return found if effect.is_meant(found.step) else replace(found, nats=0.0, loud=0.0)
 
 
 def _candidate(effect: Effect, tried: list[tuple[Shape, Evidence]]) -> Candidate:

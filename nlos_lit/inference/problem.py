@@ -256,13 +256,16 @@ class _Forward(nn.Module):
 
 @torch.no_grad()
 def _jvp(forward: _Forward, name: str, value: Tensor, tangent: Tensor) -> tuple[Tensor, Tensor]:
-    """What comes out, and its change with one parameter."""
+    """What comes out, and its change with one parameter, in the same precision.
+
+    Numbers without a dimension lose theirs in forward mode, where a Python number meets them.
+    """
 
     def at(v: Tensor) -> Tensor:
         return torch.func.functional_call(forward, {name: v}, ())
 
-    found: tuple[Tensor, Tensor] = pushed(at, (value.detach(),), (tangent,))
-    return found
+    out, change = pushed(at, (value.detach(),), (tangent,))
+    return out, change.to(out.dtype)
 
 
 @torch.no_grad()

@@ -261,9 +261,12 @@ def test_backgrounds():
     level, spots = torch.tensor(2.0), torch.tensor([3, 0])
     sloped = effect("background_slope", slope=0.4).background(level, spots).detach()
     # The gate's bins 6 … 63 have middles at τ = ∓(1 - 1/58); before the gate τ = -1.
-    assert sloped[6].item() == pytest.approx(2 * (1 - 0.4 * (1 - 1 / 58)), rel=1e-5)
-    assert sloped[63].item() == pytest.approx(2 * (1 + 0.4 * (1 - 1 / 58)), rel=1e-5)
-    assert sloped[0].item() == pytest.approx(1.2, rel=1e-5)
+    end = 1 - 1 / 58
+    assert sloped[[6, 63]].tolist() == pytest.approx([2 * math.exp(-0.4 * end), 2 * math.exp(0.4 * end)])
+    assert sloped[0].item() == pytest.approx(2 * math.exp(-0.4), rel=1e-5)
+    bent = effect("background_slope", slope=0.4, bend=0.3).background(level, spots).detach()
+    by_hand = [2 * math.exp(sign * 0.4 * end + 0.3 * (end**2 - 1 / 3)) for sign in (-1, 1)]
+    assert bent[[6, 63]].tolist() == pytest.approx(by_hand, rel=1e-5)
     extra = torch.zeros(SPOTS)
     extra[3], extra[5], extra[6] = 4.0, 2.0, 0.01
     hot = effect("hot_spots", extra=extra)
@@ -274,6 +277,9 @@ def test_backgrounds():
     assert effect("hot_spots").quantities()["number"].value.item() == 0
     leak = effect("direct_leak", amplitude=5.0, decay=4 * BIN).background(level, spots).detach()
     assert leak[[0, 6, 10]].tolist() == pytest.approx([7.0, 7.0, 2 + 5 / math.e], rel=1e-5)
+    two = effect("direct_leak", amplitude=5.0, decay=8 * BIN, quick=0.4, quick_decay=4 * BIN)
+    left = 5 * (0.6 * math.exp(-1) + 0.4 * math.exp(-2))
+    assert two.background(level, spots)[14].item() == pytest.approx(2 + left, rel=1e-5)
     ambient = effect("ambient_map", level_map=0.1)
     assert ambient.background(level, spots)[:, 0].detach() == pytest.approx(
         2 * torch.exp(ambient.field()[spots]).detach(), rel=1e-5
@@ -347,8 +353,9 @@ def test_light_that_has_not_arrived_has_no_tail():
 
 
 def test_the_direct_tail_of_a_confocal_scan_is_a_leak():
-    leak = effect("direct_leak", amplitude=5.0, decay=0.3).background(torch.tensor(2.0), torch.arange(3))
-    tail = effect("direct_tail", amplitude=5.0, decay=0.3, reach=0.1)
+    both = {"amplitude": 5.0, "decay": 0.3, "quick": 0.4, "quick_decay": 0.1}
+    leak = effect("direct_leak", **both).background(torch.tensor(2.0), torch.arange(3))
+    tail = effect("direct_tail", reach=0.1, **both)
     seen = tail.background(torch.tensor(2.0), torch.arange(3)).detach()
     assert seen[:, FIRST:] == pytest.approx(leak[FIRST:].detach().expand(3, -1), rel=1e-5)
     assert tail.declared["reach"].grid == (tail.scan.half,)
@@ -540,6 +547,26 @@ def test_priors_count_nats():
     assert drift.penalty().item() == pytest.approx(4 * (4 + 1) / 2, rel=1e-5)
     assert drift.precision() == pytest.approx((0.05 / (0.5 * deviations)) ** 2, rel=1e-5)
     assert float(effect("irf_tail").precision().sum()) == 0
+
+
+@pytest.mark.parametrize("name", ["power_drift", "time_drift"])
+def test_what_swings_in_the_mean_more_than_twelve_times_is_no_drift(name):
+    drift = effect(name, scan=grid_scan(24))
+    n = drift.amplitudes[0].size
+
+    def step(**powers: float) -> torch.Tensor:
+        """Functions with so many half periods (``_24``) over the scan, and so much power."""
+        values = torch.zeros(n)
+        for half_periods, power in powers.items():
+            values[int(half_periods[1:]) - 1] = power**0.5
+        return values
+
+    assert drift.is_meant(torch.zeros(n))
+    assert drift.is_meant(step(_23=1.0))
+    assert not drift.is_meant(step(_26=1.0))
+    assert drift.is_meant(step(_2=0.8, _100=0.2))
+    assert not drift.is_meant(step(_2=0.7, _100=0.3))
+    assert effect("ambient_drift", scan=grid_scan(24)).is_meant(torch.ones(1))
 
 
 @pytest.mark.parametrize("kind", ["single", "exhaustive"])

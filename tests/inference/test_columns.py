@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import pytest
 import torch
 from inference_scenes import (
@@ -297,6 +298,18 @@ def test_columns_of_an_accepted_effect_count_it_once():
     assert float((ours - numeric).abs().max()) < 1e-6 * float(numeric.abs().max())
     weighted = weighted_columns(problem, vignetting)[:, 0]
     assert torch.allclose(weighted, ours / problem.expected.reshape(-1).sqrt())
+
+
+@pytest.mark.parametrize("effect", [e for e in [*EFFECTS, *FREE] if not e.per_spot], ids=lambda e: e.name)
+def test_columns_have_the_precision_of_the_counts(effect):
+    """Numbers without a dimension made those of a vignetting's axis double, and no pool could be asked."""
+    torch.set_default_dtype(torch.float32)
+    scene = capture_of(scattered(10), "confocal")
+    model, scan = surfels(scene, 12), Scan.of(scene)
+    one = effect(scan)
+    one.draw(one.typical(scan), np.random.default_rng(0))
+    for column in expected_and_columns(model, Extension([one]), torch.tensor([7, 0, 3, 8]), one, shapes=True):
+        assert column.dtype == torch.float32
 
 
 def test_effects_act_in_the_order_of_the_registry_whenever_they_were_accepted():

@@ -56,8 +56,8 @@ def test_delta_method_by_hand():
     """
     ripple = effect_of("tcspc_nonlinearity", SCAN, sine=0.06, cosine=0.08, period=10.0)
     slope = effect_of("background_slope", SCAN, slope=0.2)
-    covariance = torch.diag(torch.tensor([9.0, 1.0, 4.0, 0.25]))
-    covariance[1, 2] = covariance[2, 1] = -1.0
+    covariance = torch.diag(torch.tensor([9.0, 1.0, 1.0, 4.0, 0.25]))
+    covariance[2, 3] = covariance[3, 2] = -1.0
     covariance *= 1e-5
     found = known([slope, ripple], covariance).parameters(ripple)
     variance = 1e-5 * 0.02**2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
@@ -105,7 +105,7 @@ def test_a_parameter_that_comes_back_elsewhere_is_unsure():
     """Errors of 0.3 from the counts, and of 0.4 from a fit from new seeds."""
     slope, again = (effect_of("background_slope", SCAN, slope=value) for value in (0.2, -0.2))
     scale = slope.declared["slope"].scale
-    known_slope = known([slope], torch.tensor([[(0.3 / scale) ** 2]]))
+    known_slope = known([slope], torch.diag(torch.tensor([(0.3 / scale) ** 2, 1e-6])))
     assert known_slope.parameters(slope)["slope"].stderr == pytest.approx(0.3, rel=1e-4)
     assert known_slope.parameters(slope, again)["slope"].stderr == pytest.approx(0.5, rel=1e-4)
 
@@ -167,13 +167,13 @@ def dense(fit: SurfelFit, spots: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor
     columns = torch.cat([problem.nuisance, problem.uneven], 1).double()
     x = torch.cat([columns, below])
     own = torch.cat([z, problem.residual.double()[:, None]], 1)
-    own = torch.cat([own, torch.zeros(len(below), 3, dtype=own.dtype)])
-    both = torch.cat([x, own[:, :2]], 1)
+    own = torch.cat([own, torch.zeros(len(below), own.shape[1], dtype=own.dtype)])
+    both, k = torch.cat([x, own[:, :-1]], 1), z.shape[1]
     information = both.T @ both
-    inverse = torch.linalg.inv(information)[-2:, -2:]
-    off = own - x @ torch.linalg.solve(information[:-2, :-2], x.T @ own)
+    inverse = torch.linalg.inv(information)[-k:, -k:]
+    off = own - x @ torch.linalg.solve(information[:-k, :-k], x.T @ own)
     may = columns[:, held] * prior[held].rsqrt()
-    return inverse, off[:, :2], off[:, 2], may
+    return inverse, off[:, :-1], off[:, -1], may
 
 
 @FORWARD_MODE
@@ -185,7 +185,7 @@ def test_covariance_is_the_inverse_of_the_whole_information():
     assert torch.allclose(found.covariance, inverse, rtol=5e-3)
     estimate = found.parameters(fit.extension.effects[1])["detections"]
     assert estimate.value == pytest.approx(0.3, rel=1e-5)
-    assert estimate.stderr == pytest.approx(0.05 * float(inverse[1, 1]) ** 0.5, rel=1e-3)
+    assert estimate.stderr == pytest.approx(0.05 * float(inverse[-1, -1]) ** 0.5, rel=1e-3)
 
 
 @FORWARD_MODE
@@ -195,7 +195,7 @@ def test_misfit_between_blocks_widens_the_errors():
     found = Uncertainty(fit, spots, fit.counts, block)
     inverse, z, residual, _ = dense(fit, spots)
     score, rows = z * residual[:, None], fit.counts.numel()
-    by_block = [score[:rows].view(64, -1, 2)[block == b].sum((0, 1)) for b in range(16)]
+    by_block = [score[:rows].view(64, -1, 3)[block == b].sum((0, 1)) for b in range(16)]
     by_block = torch.cat([torch.stack(by_block), score[rows:]])
     robust = inverse @ (by_block.T @ by_block) @ inverse
     grown = (robust.diagonal() / inverse.diagonal()).clamp_min(1).sqrt()

@@ -245,6 +245,20 @@ def test_a_named_effect_has_more_evidence_than_the_free_term_along_its_axis(name
     assert found[name] > 20
 
 
+@FORWARD_MODE
+@pytest.mark.parametrize(("half_periods", "asked"), [(8, True), (40, False)])
+def test_a_power_that_swings_is_not_called_a_drift(half_periods, asked):
+    drift = effect_of("power_drift", SCAN)
+    values = torch.zeros(drift.declared["drift"].size)
+    values[half_periods - 1] = 0.1
+    drift.set("drift", values)
+    found = {c.name: c for c in planted(drift, seed=2)}
+    assert found["free_scan"].evidence > 50
+    assert (found["power_drift"].evidence > 50) is asked
+    if not asked:
+        assert found["power_drift"].evidence == found["power_drift"].loud == 0
+
+
 def test_rows_are_a_fixed_choice_of_the_fitted_ones():
     class Split:
         fit = np.arange(100, 200)

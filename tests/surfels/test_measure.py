@@ -189,8 +189,8 @@ def test_a_gate_from_a_later_bin_on_is_kept():
     capture, _ = measure(hidden(), plan, SENSOR, None, ["background_slope"], {"background_slope.slope": 0.5})
     assert capture.gate == (40, 230)
     # τ at the last bin's middle: 1 - 1/190.
-    assert capture.counts[0, -1] == pytest.approx(0.2 * (1 + 0.5 * (1 - 1 / 190)), rel=1e-3)
-    assert capture.counts[0, 0] == pytest.approx(0.1, rel=1e-4)
+    assert capture.counts[0, -1] == pytest.approx(0.2 * math.exp(0.5 * (1 - 1 / 190)), rel=1e-3)
+    assert capture.counts[0, 0] == pytest.approx(0.2 * math.exp(-0.5), rel=1e-4)
 
 
 def test_a_response_narrower_than_the_splines_is_said(caplog):
