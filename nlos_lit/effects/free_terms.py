@@ -11,6 +11,7 @@ says where to look when no equation fits.
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import torch
@@ -27,6 +28,7 @@ from nlos_lit.functional.delays import filtered
 from nlos_lit.functional.surfel_paths import Paths
 
 TAILS = (4.0, 12.0, 36.0)  # bins
+MOST_BANDS = 256  # of the gate: columns for each bin of a long one would not fit into memory
 RATES = (-2.0, 2.0)  # natural logarithm of a spot's counts over the scan's mean
 
 
@@ -137,14 +139,14 @@ class _FreeBackground(FreeTerm):
 
 
 class FreeTime(FreeTerm):
-    """``m_t → m_t e^{f(t)}``, f constant within each of 40 bands of the gate."""
+    """``m_t → m_t e^{f(t)}``, f any value in each bin of the gate, or in every two, three, … of many bins."""
 
     name, axis = "free_time", "time"
     words = _words("along the time axis", "All spots count too much or too little in the same bins.")
 
     @classmethod
     def basis(cls, scan: Scan) -> Tensor:
-        return time_bands(scan, 40)
+        return time_bands(scan, MOST_BANDS)
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         return expected * torch.exp(self.values())
@@ -466,19 +468,20 @@ def tails_of(n_bins: int) -> Tensor:
     return torch.stack(changes).to(torch.get_default_dtype())
 
 
-def time_bands(scan: Scan, number: int) -> Tensor:
-    """Indicators of equal bands of the gate.
+def time_bands(scan: Scan, most: int) -> Tensor:
+    """Indicators of bands of the gate, each of as many bins.
 
     Args:
         scan: of the capture.
-        number: of bands.
+        most: bands.
 
     Returns:
-        ``[T, number]``, nothing before the gate.
+        ``[T, K ≤ most]``, nothing before the gate.
     """
     first, last = scan.gate
-    place = (torch.arange(scan.n_bins) - first) / (last - first)
-    return bands(place, number) * (place >= 0)[:, None]
+    width = math.ceil((last - first) / most)
+    index = (torch.arange(scan.n_bins) - first).div(width, rounding_mode="floor")
+    return (index[:, None] == torch.arange(math.ceil((last - first) / width))).float()
 
 
 FREE: tuple[type[Free], ...] = (

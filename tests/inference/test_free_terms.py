@@ -62,11 +62,12 @@ def test_the_null_changes_nothing_and_the_rest_does(term):
 
 def test_bands_by_hand():
     assert bands(torch.tensor([0.0, 0.24, 0.26, 0.99, 1.0]), 4).argmax(1).tolist() == [0, 0, 1, 3, 3]
-    time = time_bands(SCAN, 40)
-    assert time.shape == (GATE[1], 40)
-    assert not time[: GATE[0]].any()
-    assert torch.equal(time[GATE[0] :].sum(1), torch.ones(58))
-    assert time[GATE[0] :].argmax(1).tolist() == [k * 40 // 58 for k in range(58)]
+    for most, bins in ((40, 2), (58, 1), (256, 1), (57, 2), (12, 5)):
+        time = time_bands(SCAN, most)
+        assert time.shape == (GATE[1], -(-58 // bins))
+        assert not time[: GATE[0]].any()
+        assert torch.equal(time[GATE[0] :].sum(1), torch.ones(58))
+        assert time[GATE[0] :].argmax(1).tolist() == [k // bins for k in range(58)]
 
 
 @pytest.mark.parametrize("name", ["free_wall", "free_scan", "free_rate", "free_time"])
@@ -82,7 +83,7 @@ def test_factors_of_counts_by_hand(name):
         assert function.max() > 0.9
     elif name == "free_time":
         function = effect.functions[:, 3]
-        assert function.nonzero()[:, 0].tolist() == [GATE[0] + 5]  # 58/40 bins a band: 4.35 … 5.8
+        assert function.nonzero()[:, 0].tolist() == [GATE[0] + 3]
     else:
         function = effect.functions[:, 3:4]
         assert effect.functions.square().mean(0).tolist() == pytest.approx([1.0] * 63, rel=1e-4)
