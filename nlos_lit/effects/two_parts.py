@@ -30,8 +30,15 @@ def share_left(effect: Effect, since: Tensor) -> Tensor:
 
     Returns:
         as ``since``, 1 where that is 0.
+
+    Examples:
+        >>> import torch
+        >>> from nlos_lit.effects import EFFECTS
+        >>> from nlos_lit.effects.nominal import nominal_scan
+        >>> tail = EFFECTS.named("irf_tail")(nominal_scan())
+        >>> tail.set_all({"decay": 0.2, "quick": 0.5, "quick_decay": 0.1})
+        >>> share_left(tail, torch.tensor([0.0, 0.2])).detach().round(decimals=3)
+        tensor([1.0000, 0.2520])
     """
-    quick = effect.value("quick")
-    return (1 - quick) * (-since / effect.value("decay")).exp() + quick * (
-        -since / effect.value("quick_decay")
-    ).exp()
+    decay, quick_decay, quick = (effect.value(name) for name in ("decay", "quick_decay", "quick"))
+    return (1 - quick) * (-since / decay).exp() + quick * (-since / quick_decay).exp()

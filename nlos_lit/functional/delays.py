@@ -1,4 +1,4 @@
-"""Grids of delays and decays, and exponential delays, for effects that act along time."""
+"""Grids of delays and decays, convolutions and filters, for effects that act along time."""
 
 from __future__ import annotations
 
