@@ -26,6 +26,9 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.foreign import archived
 
 NO_OBJECTS: Mapping[str, Any] = MappingProxyType({})
+# NumPy parses the head of an array as Python, which fails at times in Python 3.11 where two threads do it at
+# once: "AST constructor recursion depth mismatch", python/cpython#106905.
+ONE_AT_A_TIME = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,8 @@ def read_plain(file: Path, kinds: Sequence[Kind] = (), shared: Mapping[str, Any]
         return {"list": list, "tuple": tuple}[what](together(part, arrays) for part in held)
 
     try:
-        with np.load(io.BytesIO(archived(file).read_bytes()), allow_pickle=False) as archive:
+        content = io.BytesIO(archived(file).read_bytes())
+        with ONE_AT_A_TIME, np.load(content, allow_pickle=False) as archive:
             return together(json.loads(archive["tree"].tobytes()), archive)
     except Exception as error:  # a foreign file may be wrong in any way
         raise not_ours(file) from error

@@ -6,6 +6,8 @@ import json
 import math
 import os
 import pickle
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -115,6 +117,26 @@ def test_foreign_files_are_refused_and_not_run(tmp_path, what):
     with pytest.raises(UserError, match=sentence):
         Steps(folder=tmp_path)("fit", "fitting", "base", lambda: 1)
     assert not folder.exists()
+
+
+def test_threads_read_one_after_the_other(tmp_path, monkeypatch):
+    """Two that parse heads of arrays at once may each find the other's file damaged."""
+    within, most, load = [], [], np.load
+
+    def slow(*given, **named):
+        within.append(1)
+        most.append(len(within))
+        time.sleep(0.02)
+        archive = load(*given, **named)
+        within.pop()
+        return archive
+
+    write_plain(tmp_path / "one.npz", torch.arange(3))
+    monkeypatch.setattr(np, "load", slow)
+    with ThreadPoolExecutor(4) as several:
+        found = list(several.map(read_plain, [tmp_path / "one.npz"] * 8))
+    assert all(torch.equal(one, torch.arange(3)) for one in found)
+    assert most == [1] * 8
 
 
 def test_a_plain_file_that_is_no_step_is_refused(tmp_path):
