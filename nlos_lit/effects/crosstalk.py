@@ -110,16 +110,16 @@ class Crosstalk(Effect):
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         lag = self.value("lag")
         whole = lag.detach().floor()
-        part, k = lag - whole, int(whole)
+        part, k = lag - whole, whole.long()
         before = (1 - part) * self.earlier(spots, k) + part * self.earlier(spots, k + 1)
         return expected + self.value("leak") * before
 
-    def earlier(self, spots: Tensor, lag: int) -> Tensor:
+    def earlier(self, spots: Tensor, lag: Tensor) -> Tensor:
         """Light of the spots that were taken ``lag`` spots before.
 
         Args:
             spots: ``[B]`` indices into the scan.
-            lag: spots.
+            lag: spots, a whole number.
 
         Returns:
             ``[B, T]`` counts per bin; zeros where there was no spot yet.

@@ -300,13 +300,8 @@ def evidence(
         what the counts say of it.
     """
     z, rows = z * deviation.float(), raw.shape[0] * raw.shape[1]
-    cells = block[:, None] * SEGMENTS + torch.arange(SEGMENTS)
-    last = SEGMENTS * (int(block.max()) + 1)
-    s = z.new_zeros(last, z.shape[1]).double()
-    f = s.new_zeros(last, z.shape[1], z.shape[1])
-    for k, (each, r) in enumerate(segments(z[:rows].view(raw.shape), residual[:rows].view(raw.shape[:2]))):
-        s.index_add_(0, cells[:, k], torch.einsum("stk,st->sk", each, r).double())
-        f.index_add_(0, cells[:, k], torch.einsum("stk,stl->skl", each, each).double())
+    s, f = by_cells(z[:rows].view(raw.shape), residual[:rows].view(raw.shape[:2]), block)
+    last = len(s)
     held = z[rows:].double()
     s = torch.cat([s, held * residual[rows:, None]])
     f = torch.cat([f, held[:, :, None] * held[:, None]])
@@ -391,6 +386,37 @@ def lit_share(columns: Tensor, lit: Tensor) -> float:
     """
     told = columns.square().sum(1).double()
     return float(told @ lit.double() / told.sum().clamp_min(1e-30))
+
+
+def by_cells(z: Tensor, residual: Tensor, block: Tensor) -> tuple[Tensor, Tensor]:
+    """Scores and information of each part along time of each wall block.
+
+    Args:
+        z: ``[S, T, k]`` columns.
+        residual: ``[S, T]``.
+        block: ``[S]`` number of each spot's wall block.
+
+    Returns:
+        ``[C, k]`` and ``[C, k, k]``, the ``SEGMENTS`` parts of a block one after the other.
+
+    Examples:
+        >>> one = torch.ones(2, SEGMENTS, 1)
+        >>> scores, information = by_cells(one, 3 * one[..., 0], torch.tensor([1, 0]))
+        >>> scores[:, 0].tolist(), information.shape
+        ([3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0], torch.Size([8, 1, 1]))
+    """
+    order, sizes = block.argsort(stable=True), torch.bincount(block).tolist()
+    parts = [
+        zip(each.split(sizes), left.split(sizes), strict=True)
+        for each, left in segments(z[order], residual[order])
+    ]
+    s, f = list[Tensor](), list[Tensor]()
+    for cells in zip(*parts, strict=True):
+        for each, left in cells:
+            rows = each.flatten(0, 1)
+            s.append(rows.T @ left.flatten())
+            f.append(rows.T @ rows)
+    return torch.stack(s).double(), torch.stack(f).double()
 
 
 def segments(z: Tensor, residual: Tensor) -> Iterator[tuple[Tensor, Tensor]]:

@@ -109,13 +109,23 @@ def factors(
         >>> factors(torch.tensor([4.0]), torch.tensor([1.0]), 0.0, 1.0, True)
         tensor([0.])
     """
+    return _mixed(_whole(score, information, width, positive), share if positive else 1.0)
+
+
+def _whole(score: Tensor, information: Tensor, width: float | Tensor, positive: bool) -> Tensor:
+    """:func:`factors` where every spot has a coefficient: share 1."""
     grown = 1 + width**2 * information
     factor = 0.5 * width**2 * score**2 / grown - 0.5 * grown.log()
     if not positive:
         return factor
-    factor = factor + math.log(2) + torch.special.log_ndtr(width * score * grown.rsqrt())
-    part = torch.tensor(share, dtype=score.dtype)
-    return torch.logaddexp(torch.log1p(-part), part.log() + factor)
+    return factor + math.log(2) + torch.special.log_ndtr(width * score * grown.rsqrt())
+
+
+def _mixed(whole: Tensor, share: float) -> Tensor:
+    """:func:`factors` where a share of the spots has a coefficient, from what they are where all have."""
+    if share == 1.0:
+        return whole
+    return torch.logaddexp(whole.new_tensor(1 - share).log(), whole + math.log(share))
 
 
 def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[float, float, float]:
@@ -132,8 +142,9 @@ def best_width(score: Tensor, information: Tensor, positive: bool) -> tuple[floa
     typical = float(information.median().clamp_min(1e-30).rsqrt())
     best = (0.0, 0.0, 1.0)
     widths = typical * 2.0 ** torch.arange(-6, 13, 0.5, dtype=score.dtype)
+    whole = _whole(score, information, widths[:, None], positive)
     for share in SHARES if positive else (1.0,):
-        gains = factors(score, information, widths[:, None], share, positive).sum(1)
+        gains = _mixed(whole, share).sum(1)
         k = int(gains.argmax())
         best = max(best, (float(gains[k]), float(widths[k]), share))
     if best[0] == 0.0:

@@ -29,7 +29,7 @@ from nlos_lit.inference.evidence import (
     step_bounds,
 )
 from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
-from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
+from nlos_lit.inference.problem import Problem, build_problem, columns_at, weighted_columns
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.effect_start import asked_of
 from nlos_lit.surfels.fit import SurfelFit
@@ -619,9 +619,7 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
     costs. So shapes are ranked by the score over the unprojected information.
     """
     shapes, kept = _shapes(problem, projector, effect), list[tuple[float, Shape, Tensor]]()
-    for shape in shapes:
-        effect.set_all(shape)
-        z = weighted_columns(problem, effect)
+    for shape, z in zip(shapes, columns_at(problem, effect, shapes), strict=True):
         worth = 0.0
         if len(shapes) > 1:
             score, information = (z.T @ projector.residual[: len(z)]).double(), (z.T @ z).double()
@@ -644,9 +642,8 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
     """One random coefficient a spot: do the spots' own scores scatter more than counts alone let them?"""
     shapes, best = effect.shape_grid(), None
     nats = []
-    for shape in shapes:
-        effect.set_all(shape)
-        column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
+    for shape, columns in zip(shapes, columns_at(problem, effect, shapes), strict=True):
+        column = columns[:, 0].view(problem.expected.shape)
         score, information, scatter = _scores(problem, projector, effect, column)
         gain, width, share = best_width(score, information, sparse(effect))
         nats.append(gain)

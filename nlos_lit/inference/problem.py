@@ -17,7 +17,7 @@ All derivatives are exact (forward mode); the response, gain and counting stages
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
@@ -30,6 +30,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.functional.compiled import tensor_by_tensor
 from nlos_lit.functional.surfel_paths import quadrature, spline_slopes, spline_weights, trace
 from nlos_lit.surfels.model import SurfelModel
@@ -38,6 +39,8 @@ from nlos_lit.surfels.model import SurfelModel
 PATCHES = 32
 CHUNK = 1 << 25  # elements of a batch's columns
 BATCH = 1 << 19  # … of a batch's transients
+LANES = 1 << 22  # … of changes that are worked out side by side
+LATE = frozenset({"spot", "counting"})  # stages that act on light after the response
 _dual = Lock()  # torch counts the levels of dual numbers for all threads together
 
 
@@ -186,8 +189,7 @@ def expected_and_columns(
         ``[S, bins]`` expected counts with the effect, and ``[S·bins, k]`` columns; a per-spot effect gives
         one column: every spot's own.
     """
-    first, present = model.gate[0], list(extension.effects)
-    whole = Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
+    first, whole = model.gate[0], _with(extension, effect)
     factors = effect.factors(spots)
     if factors is not None:
         one = effect.alone()
@@ -195,11 +197,8 @@ def expected_and_columns(
         unit = effect.amplitudes[0].scale / one.amplitudes[0].scale
         by_spot = alike.view(len(spots), -1, 1, alike.shape[1])
         return expected, (by_spot * (unit * factors)[:, None, :, None]).flatten(2).flatten(0, 1)
-    index = list(whole.effects).index(effect)
+    prefix = _prefix(whole, effect)
     wanted = effect.amplitudes + (effect.shapes if shapes else [])
-    names = [
-        (f"extension.effects.{index}.raw_{p.name}", getattr(effect, f"raw_{p.name}"), p.size) for p in wanted
-    ]
     parts, values = [], []
     by_paths = effect.needs_paths or transients is None
     size = model.batch if by_paths else max(1, BATCH // model.n_bins)
@@ -208,16 +207,113 @@ def expected_and_columns(
         forward = _staged(
             model, whole, effect, part, None if transients is None else transients[start : start + size]
         )
-        columns = []
-        for name, raw, number in names:
-            for k in range(1 if effect.per_spot else number):
-                tangent = torch.ones_like(raw) if effect.per_spot else torch.zeros_like(raw)
-                tangent[k] = 1.0
-                value, column = _jvp(forward, name, raw, tangent)
-                columns.append(column)
+        if effect.stage in LATE:
+            with torch.no_grad():
+                value = forward()
+            columns = _side_by_side(forward, prefix, effect, wanted, value.numel(), {}).permute(1, 2, 0)
+        else:
+            changes = []
+            for p in wanted:
+                raw = getattr(effect, f"raw_{p.name}")
+                for tangent in _tangents(effect, p):
+                    value, change = _jvp(forward, f"{prefix}{p.name}", raw, tangent)
+                    changes.append(change)
+            columns = torch.stack(changes, -1)
         values.append(value[:, first:])
-        parts.append(torch.stack(columns, -1)[:, first:].flatten(0, 1))
+        parts.append(columns[:, first:].flatten(0, 1))
     return torch.cat(values), torch.cat(parts)
+
+
+def columns_at(problem: Problem, effect: Effect, shapes: Sequence[Mapping[str, float]]) -> Iterator[Tensor]:
+    """:func:`weighted_columns` of an effect at each of some shapes.
+
+    What acts on light that has arrived is worked out for many of them side by side: one pass waits for its
+    calls more than for its numbers.
+
+    Args:
+        problem: of the spots.
+        effect: one of the extension's, or another; it is left at one of the shapes.
+        shapes: values of its shape parameters.
+
+    Yields:
+        ``[S·bins, k]`` of each.
+    """
+    if effect.stage not in LATE or len(shapes) < 2:
+        for shape in shapes:
+            effect.set_all(shape)
+            yield weighted_columns(problem, effect)
+        return
+    whole, first = _with(problem.extension, effect), problem.model.gate[0]
+    forward = _staged(problem.model, whole, effect, problem.spots, problem.transients)
+    number = sum(1 if effect.per_spot else p.size for p in effect.amplitudes)
+    weight, size = problem.expected.rsqrt()[..., None], max(1, CHUNK // (number * problem.transients.numel()))
+    for start in range(0, len(shapes), size):
+        stored = list[list[Tensor]]()
+        for shape in shapes[start : start + size]:
+            effect.set_all(shape)
+            stored.append([getattr(effect, f"raw_{p.name}").detach().clone() for p in effect.shapes])
+        at = {p.name: torch.stack(v) for p, v in zip(effect.shapes, zip(*stored, strict=True), strict=True)}
+        given = (forward, _prefix(whole, effect), effect, effect.amplitudes, problem.transients.numel(), at)
+        changes = _side_by_side(*given)
+        for columns in changes.split(number):
+            yield (columns.permute(1, 2, 0)[:, first:] * weight).flatten(0, 1)
+
+
+def _with(extension: Extension, effect: Effect) -> Extension:
+    """The extension with an effect that it may have already, in order of application."""
+    present = list(extension.effects)
+    return Extension(sorted([*present, *(() if effect in present else (effect,))], key=acting_order))
+
+
+def _prefix(whole: Extension, effect: Effect) -> str:
+    """What the names of an effect's stored values begin with in :class:`_Forward`."""
+    return f"extension.effects.{list(whole.effects).index(effect)}.raw_"
+
+
+def _tangents(effect: Effect, p: Parameter) -> Tensor:
+    """``[k, size]`` by each stored value of a parameter, or by all together: every spot's own."""
+    return torch.ones(1, p.size) if effect.per_spot and p.null is not None else torch.eye(p.size)
+
+
+@torch.no_grad()
+def _side_by_side(
+    forward: _Forward,
+    prefix: str,
+    effect: Effect,
+    wanted: list[Parameter],
+    elements: int,
+    at: dict[str, Tensor],
+) -> Tensor:
+    """``[J·k, B, T]`` changes of what comes out with each of k stored values, at each of J shapes.
+
+    Args:
+        forward: the model.
+        prefix: of the names of the effect's stored values.
+        effect: whose they are.
+        wanted: parameters by which it is.
+        elements: B·T.
+        at: ``[J, 1]`` stored values of its shapes, by name; its own where there are none.
+    """
+    raws = {p.name: getattr(effect, f"raw_{p.name}").detach() for p in wanted}
+    tangents = torch.block_diag(*(_tangents(effect, p) for p in wanted))
+    count = len(next(iter(at.values()))) if at else 1
+    each = tangents.repeat(count, 1).split([p.size for p in wanted], 1)
+    towards = dict(zip(raws, each, strict=True))
+    at = {name: values.repeat_interleave(len(tangents), 0) for name, values in at.items()}
+
+    def change(towards: dict[str, Tensor], at: dict[str, Tensor]) -> Tensor:
+        def out(values: dict[str, Tensor]) -> Tensor:
+            given = {prefix + name: value for name, value in {**at, **values}.items()}
+            found: Tensor = torch.func.functional_call(forward, given, ())
+            return found
+
+        both = torch.func.jvp(out, (raws,), (towards,))
+        found: Tensor = both[1].to(both[0].dtype)
+        return found
+
+    with _dual, tensor_by_tensor():
+        found: Tensor = torch.func.vmap(change, chunk_size=max(1, LANES // elements))(towards, at)
+    return found
 
 
 def weighted_columns(problem: Problem, effect: Effect, shapes: bool = False) -> Tensor:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from types import SimpleNamespace
 
@@ -31,7 +32,7 @@ from nlos_lit.inference.evidence import (
     step_bounds,
 )
 from nlos_lit.inference.per_spot import neighbours
-from nlos_lit.inference.pool import Candidate, screen
+from nlos_lit.inference.pool import Candidate, Shape, screen
 from nlos_lit.inference.problem import Problem
 
 SPOTS, BINS, DRAWS = 42, 6, 200
@@ -362,9 +363,21 @@ def own_columns(k: int, seed: int) -> Tensor:
     return own
 
 
+def stand_in(monkeypatch: pytest.MonkeyPatch, columns: Callable[..., Tensor]) -> None:
+    """For the columns of effects, at the shape that they have, and at each of several."""
+
+    def at_each(problem: Problem, effect: Effect, shapes: list[Shape]) -> Iterator[Tensor]:
+        for shape in shapes:
+            effect.set_all(shape)
+            yield columns(problem, effect)
+
+    monkeypatch.setattr(pool, "weighted_columns", columns)
+    monkeypatch.setattr(pool, "columns_at", at_each)
+
+
 @pytest.fixture
 def known(monkeypatch):
-    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: columns(effect))
+    stand_in(monkeypatch, lambda problem, effect, *_, **__: columns(effect))
 
 
 def look(name: str, residual: Tensor) -> Candidate:
@@ -408,7 +421,7 @@ def test_one_step_is_unbiased_and_its_error_right(known):
 def test_what_the_base_can_imitate_has_no_evidence(monkeypatch):
     """The nuisance explains the residual as well, however large it is."""
     x = normal(ROWS, 7, seed=1)
-    monkeypatch.setattr(pool, "weighted_columns", lambda *_, **__: 10 * x[:, :1] + 5 * x[:, 3:4])
+    stand_in(monkeypatch, lambda *_, **__: 10 * x[:, :1] + 5 * x[:, 3:4])
     for name in ("time_offset", "irf_tail"):
         found = look(name, 30 * x[:, 0] + 30 * x[:, 3] + normal(ROWS, seed=8))
         assert found.evidence < 0.5
@@ -426,16 +439,18 @@ def test_retained_information_is_what_the_base_leaves(known):
 
 
 def test_every_shape_that_could_have_been_counts(monkeypatch):
-    """One of many periods has evidence: its Bayes factor over their number. Two alike: twice as much."""
+    """One of many periods has evidence: its Bayes factor over their number. Two alike: twice as much. None
+    between them has any.
+    """
     grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
     right = {grid[29]["period"]}
 
     def ripple(problem: Problem, effect: Effect, *_: object, **__: object) -> Tensor:
         period = float(effect.value("period").detach())
-        near = min(grid, key=lambda shape: abs(shape["period"] - period))["period"]
-        return own_columns(2, 5 if near in right else 100 + int(1000 * near)) * 10 / ROWS**0.5
+        known = any(period == pytest.approx(of_grid) for of_grid in right)
+        return own_columns(2, 5 if known else 100 + int(1e4 * period)) * 10 / ROWS**0.5
 
-    monkeypatch.setattr(pool, "weighted_columns", ripple)
+    stand_in(monkeypatch, ripple)
     truth = own_columns(2, 5) @ torch.tensor([3.0, -4.0]) * 10 / ROWS**0.5 + normal(ROWS, seed=7)
     alone = look("tcspc_nonlinearity", truth)
     assert alone.shape["period"] == grid[29]["period"]
@@ -462,9 +477,7 @@ def ripple(period: float, rows: int = ROWS) -> Tensor:
 
 def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
-    monkeypatch.setattr(
-        pool, "weighted_columns", lambda problem, effect, *_: ripple(float(effect.value("period").detach()))
-    )
+    stand_in(monkeypatch, lambda problem, effect, *_: ripple(float(effect.value("period").detach())))
     grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
     assert len(grid) > 2 * pool.KEPT
     period = grid[29]["period"]
@@ -478,9 +491,8 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
 
 def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enough_to_tell(monkeypatch):
     """A ripple of a period that the grid does not have: the nearest of the grid leaves much of it."""
-    monkeypatch.setattr(
-        pool,
-        "weighted_columns",
+    stand_in(
+        monkeypatch,
         lambda problem, effect, *_: ripple(float(effect.value("period").detach()), 44),
     )
     grid = [shape["period"] for shape in effect_of("tcspc_nonlinearity", SCAN).shape_grid()]
@@ -532,7 +544,7 @@ def alike(monkeypatch) -> list[Candidate]:
         own = (traces @ torch.tensor(shares))[:, None] if any(shares) else normal(ROWS, 1, seed=30)
         return torch.cat([own, normal(ROWS, more, seed=31)], 1) if len(shares) and any(shares) else own
 
-    monkeypatch.setattr(pool, "weighted_columns", made)
+    stand_in(monkeypatch, made)
     return traces
 
 
@@ -644,7 +656,7 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
     """Column 1 at every bin of a spot, F = 6 a spot, 48/9 where the mean of eight neighbours is taken off:
     δ ~ N(0, 1.5²) is seen as an excess of scatter, and no scatter as none, nor what is smooth over the wall.
     """
-    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
+    stand_in(monkeypatch, lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
     delta = 1.5 * normal(SPOTS, seed=12)
     nuisance = 1e-6 * normal(ROWS, 2, seed=13)
     wide = problem(delta.repeat_interleave(BINS) + normal(ROWS, seed=14), nuisance)
@@ -678,7 +690,7 @@ def test_per_spot_effects_are_tested_by_their_scatter(monkeypatch):
 )
 def test_only_what_single_spots_have_over_their_neighbours_is_no_misfit(monkeypatch, name, lit):
     """Delays and gains of single spots; what is rare may be the scene's where that sends light."""
-    monkeypatch.setattr(pool, "weighted_columns", lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
+    stand_in(monkeypatch, lambda problem, effect, *_, **__: torch.ones(ROWS, 1))
     whole = problem(normal(ROWS, seed=14), 1e-6 * normal(ROWS, 2, seed=13))
     whole.model, whole.lit = wall(SPOTS), (torch.arange(BINS) >= BINS // 3).float().repeat(SPOTS)
     (found,) = screen(whole, [effect_of(name, SCAN)], BLOCK)
