@@ -27,7 +27,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.problem import expected_and_columns
+from nlos_lit.inference.problem import FEWEST, expected_and_columns
 from nlos_lit.surfels.model import SurfelModel
 
 SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)
@@ -208,7 +208,7 @@ def spot_scores(
         score ``[S]``, information ``[S]``, and expected counts ``[S, T]``.
     """
     found, columns = expected_and_columns(model, extension, spots, effect, transients=transients)
-    expected, column = found.double().clamp_min(1e-6), columns.view(found.shape).double()
+    expected, column = found.double().clamp_min(FEWEST), columns.view(found.shape).double()
     return (column * (counts / expected - 1)).sum(1), (column**2 / expected).sum(1).clamp_min(1e-30), expected
 
 

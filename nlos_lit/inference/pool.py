@@ -16,6 +16,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
+from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.inference.evidence import (
@@ -29,7 +30,14 @@ from nlos_lit.inference.evidence import (
     step_bounds,
 )
 from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
-from nlos_lit.inference.problem import Problem, build_problem, columns_at, weighted_columns
+from nlos_lit.inference.problem import (
+    FEWEST,
+    Problem,
+    build_problem,
+    columns_at,
+    expected_and_columns,
+    weighted_columns,
+)
 from nlos_lit.inference.split import Split
 from nlos_lit.surfels.effect_start import asked_of
 from nlos_lit.surfels.fit import SurfelFit
@@ -364,25 +372,24 @@ def own_evidence(
     laws = {n: e for n, e in effects.items() if not e.per_spot}
     columns = {n: weighted_columns(problem, e, shapes=True) for n, e in laws.items()}
     freed = _freed(whole, columns)
-    above = {n: _above_null(e) for n, e in effects.items()}
+    above = {n: _above_null(e) for n, e in laws.items()}
     does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
     @cache
     def one(name: str, gone: tuple[str, ...]) -> tuple[float, float, float]:
         """Nats, ``lit``, and nats if all of the scatter were the term's own."""
         effect, others = effects[name], [n for n in laws if n != name and n not in gone]
-        many, at = math.log(len(effect.shape_grid())), above[name]
+        many = math.log(len(effect.shape_grid()))
         residual = whole.left[:, 0] + sum((does[n] for n in gone if n in does), torch.zeros(()))
         z = torch.cat([whole.left[:, :0], *(freed[n] for n in others)], 1)
         precision = torch.cat([whole.left.new_zeros(0), *(effects[n].precision() for n in others)])
         if effect.per_spot:
-            column = weighted_columns(problem, effect)[:, 0].view(problem.expected.shape)
-            beside = whole.beside(z, precision, residual)
-            score, information, _ = _scores(problem, beside, effect, column, at[problem.spots])
+            column, residual = _without(problem, effect, whole.beside(z, precision, residual))
+            score, information, _ = _scores(problem, effect, column, residual)
             nats = best_width(score, information, sparse(effect))[0] - many
             return nats, _lit(problem, effect, column), nats
-        beside = whole.beside(z, precision, residual + does[name])
-        own = (columns[name][:, : len(at)], beside.freed(freed[name][:, : len(at)]))
+        beside, number = whole.beside(z, precision, residual + does[name]), len(above[name])
+        own = (columns[name][:, :number], beside.freed(freed[name][:, :number]))
         found = _evidence(problem, beside, effect, *own, block)
         return found.nats - many, found.lit, found.loud - many
 
@@ -417,10 +424,28 @@ def own_evidence(
 
 def _above_null(effect: Effect) -> Tensor:
     """``[k]`` how far an effect's stored amplitudes lie from their nulls."""
+    return _amplitudes(effect) - _amplitudes(_null_of(effect))
+
+
+def _null_of(effect: Effect) -> Effect:
+    """A copy that does nothing."""
     null = copy.deepcopy(effect)
     for p in null.amplitudes:
         null.set(p.name, 0.0 if p.null is None else p.null)
-    return _amplitudes(effect) - _amplitudes(null)
+    return null
+
+
+def _without(problem: Problem, effect: Effect, projector: Projector) -> tuple[Tensor, Tensor]:
+    """Columns and residual ``[S, bins]`` of a term with a number for each spot, in the model without it.
+
+    A spot that loses all its light counts nothing by the model, and one count there would weigh without end.
+    """
+    others = Extension([e for e in problem.extension.effects if e is not effect])
+    given = (problem.model, others, problem.spots, _null_of(effect))
+    expected, column = expected_and_columns(*given, transients=problem.transients)
+    expected, present = expected.clamp_min(FEWEST), problem.expected
+    left = projector.residual[: present.numel()].view_as(present) * present.sqrt()
+    return column.view_as(present) * expected.rsqrt(), (left + present - expected) * expected.rsqrt()
 
 
 def _lit(problem: Problem, effect: Effect, column: Tensor) -> float:
@@ -641,10 +666,11 @@ def _shapes(problem: Problem, projector: Projector, effect: Effect) -> list[Shap
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:
     """One random coefficient a spot: do the spots' own scores scatter more than counts alone let them?"""
     shapes, best = effect.shape_grid(), None
+    residual = projector.residual[: problem.expected.numel()].view_as(problem.expected)
     nats = []
     for shape, columns in zip(shapes, columns_at(problem, effect, shapes), strict=True):
         column = columns[:, 0].view(problem.expected.shape)
-        score, information, scatter = _scores(problem, projector, effect, column)
+        score, information, scatter = _scores(problem, effect, column, residual)
         gain, width, share = best_width(score, information, sparse(effect))
         nats.append(gain)
         if best is None or gain > best[0]:
@@ -662,15 +688,12 @@ def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candida
 
 
 def _scores(
-    problem: Problem, projector: Projector, effect: Effect, column: Tensor, at: Tensor | None = None
+    problem: Problem, effect: Effect, column: Tensor, residual: Tensor
 ) -> tuple[Tensor, Tensor, float]:
     """Score and information of each spot's own coefficient ``[S]``, discounted by their scatter, and that."""
-    residual = projector.residual[: column.numel()].view_as(column)
     information = column.square().sum(1).double().clamp_min(1e-30)
     score = (column * residual).sum(1).double()
     scatter = spot_scatter(column, residual)
-    if at is not None:
-        score = score + information * at
     if not effect.in_runs:
         score, information = own_part(score, information, neighbours(problem.model, problem.spots))
     return score / scatter, information / scatter, scatter

@@ -37,6 +37,7 @@ from nlos_lit.surfels.model import SurfelModel
 
 # Of the scene. Each looks brighter from some wall points than from others: normals are not known exactly.
 PATCHES = 32
+FEWEST = 1e-6  # counts that are expected in a bin, so that √μ can be divided by
 CHUNK = 1 << 25  # elements of a batch's columns
 BATCH = 1 << 19  # … of a batch's transients
 LANES = 1 << 22  # … of changes that are worked out side by side
@@ -119,7 +120,7 @@ def build_problem(
         the problem.
     """
     with torch.no_grad():
-        expected = model.expected(spots, extension).clamp_min(1e-6)
+        expected = model.expected(spots, extension).clamp_min(FEWEST)
     m, first = len(model), model.gate[0]
     towards, patch, coarse = towards_wall(model), patches_of(model, patches or m), patches_of(model, PATCHES)
     size = max(1, CHUNK // (model.n_bins * (3 * m + 6 * PATCHES)))

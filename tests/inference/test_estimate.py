@@ -365,6 +365,26 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
 
 
 @FORWARD_MODE
+def test_spots_that_lose_all_have_no_more_evidence_than_counts_that_they_lost():
+    """Also where the gate is said to let nothing pass, and three counts came before it."""
+    scene = capture_of(raster(16), scan_shape=(16, 16))
+    scan, model = Scan.of(scene), surfels(scene, level=10.0)
+    gate, spots = effect_of("spot_gate", scan, start=30.0), torch.arange(5, 256, 20)
+    gate.set("lost", torch.zeros(256).index_fill(0, spots, 1.0))
+    measured = drawn(model, Extension([gate]), scene)
+    split = split_spots(measured)
+    late = np.intersect1d(spots.numpy(), split.fit)
+    measured.counts[late[:3], 25] += 1
+    fit = fit_of(model, measured, Extension([gate]), split.fit)
+    nats = own_evidence(fit, split, 256, 3, ["spot_gate"], lambda lit, lost: 0.0)[0]["spot_gate"][0]
+    first = scan.gate[0]
+    with torch.no_grad():
+        lost = float(model.expected(torch.from_numpy(late), Extension([]))[:, : 30 - first].sum())
+    assert len(late) > 5
+    assert 0.2 * lost < nats < lost
+
+
+@FORWARD_MODE
 def test_who_has_too_little_leaves_and_the_others_are_asked_again(findings):
     """A free term along time does what the tail does: neither has much beside the other; it leaves first."""
     found, measured, split, scan = findings
