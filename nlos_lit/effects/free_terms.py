@@ -108,10 +108,28 @@ class FreeTerm(Free):
         return {"rms": Quantity(length(field / field.numel() ** 0.5, p.scale), p.unit, kind=p.kind)}
 
 
-class _AlongScan(FreeTerm):
-    """Splines over the scan; each octave of frequencies is as likely."""
+class AlongScan(FreeTerm):
+    """Splines over the scan; each octave of frequencies is as likely, and may then have a width of its own.
+
+    Fitted spots leave gaps, of a line or so. What swings must be followed through them, and what does not
+    must not swing there.
+
+    Attributes:
+        relative: ``[K]`` prior deviations that the counts ask for, over those that were likely beforehand.
+    """
 
     axis = "scan"
+    octave: Tensor
+    relative: Tensor
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        share = over_scan(scan, self.splines(scan))[1]
+        self.octave = (-0.5 * share.log2()).floor().long()
+        self.register_buffer("relative", torch.ones(len(share)))
+
+    def _precision(self, p: Parameter) -> Tensor:
+        return super()._precision(p) / self.relative.cpu().square()
 
     @classmethod
     def splines(cls, scan: Scan) -> int:
@@ -185,7 +203,7 @@ class FreeLines(FreeTerm):
         return signal * torch.exp(self.at(spots))
 
 
-class FreeScan(_AlongScan, _FreeCounts):
+class FreeScan(AlongScan, _FreeCounts):
     """``m → m e^{f(u)}``, f any combination of 128 splines over the scan, or of one for every four spots."""
 
     name = "free_scan"
@@ -218,7 +236,7 @@ class FreeRate(FreeTerm):
         return expected * torch.exp(self.tents(expected) @ self.value("field").reshape(-1))[:, None]
 
 
-class FreeScanBackground(_AlongScan, _FreeBackground):
+class FreeScanBackground(AlongScan, _FreeBackground):
     """``background → background e^{f(u)}``, f as of ``free_scan``."""
 
     name = "free_scan_background"
@@ -257,7 +275,7 @@ class _FreeDelay(FreeTerm):
         return length + self.at(spots)[:, None]
 
 
-class FreeScanDelay(_AlongScan, _FreeDelay):
+class FreeScanDelay(AlongScan, _FreeDelay):
     """``L → L + f(u)``, f as of ``free_scan``."""
 
     name = "free_scan_delay"
@@ -398,7 +416,7 @@ class _EqualWidth(_Equally, _FreeWidth):
     name = "equal_width"
 
 
-class FreeWidthScan(_AlongScan, _FreeWidth):
+class FreeWidthScan(AlongScan, _FreeWidth):
     """f any combination of 16 splines over the scan; each octave of frequencies is as likely."""
 
     name = "free_width_scan"

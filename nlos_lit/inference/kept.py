@@ -36,7 +36,7 @@ def _parts(effect: Effect) -> dict[str, Any]:
     """Stored values, the numbers that it has besides, and whether optimisers move it."""
     return {
         "name": effect.name,
-        "stored": dict(effect.named_parameters()),
+        "stored": dict(effect.state_dict(keep_vars=True)),
         "numbers": _numbers(effect),
         "moves": any(p.requires_grad for p in effect.parameters()),
     }
@@ -47,7 +47,7 @@ def _effect(
     scan: Scan, name: str, stored: dict[str, torch.Tensor], numbers: dict[str, float], moves: bool
 ) -> Effect:
     effect = next(cls for cls in [*EFFECTS, *FREE, *FORMULAS] if cls.name == name)(scan)
-    own = dict(effect.named_parameters())
+    own = dict(effect.state_dict(keep_vars=True))
     if set(own) != set(stored) or set(_numbers(effect)) != set(numbers):
         raise ValueError(f"these are no values of {name}")
     for key, value in stored.items():

@@ -17,7 +17,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, FREE_NAMES
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES, AlongScan
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.inference.evidence import (
     SEGMENTS,
@@ -566,7 +566,8 @@ def _evidence(
     problem: Problem, projector: Projector, effect: Effect, columns: Tensor, freed: Freed, block: Tensor
 ) -> Evidence:
     raw = columns.reshape(*problem.expected.shape, -1)
-    found = best_evidence(projector, raw, freed, block, prior_deviations(effect), step_bounds(effect))
+    prior = prior_deviations(effect), step_bounds(effect), effect.octave
+    found = best_evidence(projector, raw, freed, block, *prior)
     return found if effect.is_meant(found.step) else replace(found, nats=0.0, loud=0.0)
 
 
@@ -583,6 +584,8 @@ def _with_scale(effect: Effect, found: Evidence) -> Effect:
     """The effect, its prior as wide as the counts ask for."""
     if bool(effect.precision().any()) and found.scale:
         effect.prior_scale = found.scale
+    if isinstance(effect, AlongScan) and found.relative is not None:
+        effect.relative.copy_(found.relative)
     return effect
 
 

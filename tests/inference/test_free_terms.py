@@ -16,6 +16,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, tails_of, time_bands
 from nlos_lit.effects.scan_pieces import bands
 from nlos_lit.inference import pool
+from nlos_lit.inference.evidence import by_octave, prior_deviations
 from nlos_lit.inference.pool import Candidate, screen
 from nlos_lit.inference.problem import build_problem
 
@@ -258,6 +259,52 @@ def test_a_power_that_swings_is_not_called_a_drift(half_periods, asked):
     assert (found["power_drift"].evidence > 50) is asked
     if not asked:
         assert found["power_drift"].evidence == found["power_drift"].loud == 0
+
+
+@pytest.mark.parametrize("half_periods", [5, 60])
+def test_what_swings_is_followed_through_gaps(half_periods):
+    """Spots that were not fitted, nine in a row after eighteen that were: a width for each octave of
+    frequencies follows a quick wave there to less than half of the error that one for all leaves, and a slow
+    one as well.
+    """
+    scan = Scan.of(capture_of(raster(24)))
+    term = effect_of("free_scan", scan)
+    place = torch.empty(576).double()
+    place[scan.rank.argsort()] = torch.arange(576.0).double()
+    wave = 0.1 * torch.sin(torch.pi * half_periods * place / 576 + 0.7)
+    wave -= wave.mean()
+    noise = 0.03 * torch.from_numpy(np.random.default_rng(4).standard_normal(576))
+    functions = term.functions.double() * torch.tensor(term.declared["field"].prior).double()
+    seen = (place.long() // 9) % 3 != 1
+    score = functions[seen].T @ (wave + noise)[seen] / 0.03**2
+    information = functions[seen].T @ functions[seen] / 0.03**2
+    errors = []
+    for octave in (torch.zeros_like(term.octave), term.octave):
+        mean, relative = by_octave(score, information, octave, 1.0)
+        errors.append(float((functions @ mean - wave)[~seen].square().mean().sqrt()))
+    assert errors[1] < (0.5 if half_periods == 60 else 1.0) * errors[0]
+    assert errors[1] < 0.03
+    right = term.octave == int(np.log2(half_periods))
+    assert relative[right].min() > relative[~right].max()
+
+
+def test_a_width_by_octave_is_the_priors():
+    """Twice as wide: a quarter of the penalty."""
+    term = with_one("free_scan", 40, 0.1)
+    before = float(term.penalty().detach())
+    term.relative[term.octave == term.octave[40]] = 2.0
+    assert float(term.penalty().detach()) == pytest.approx(before / 4)
+    assert prior_deviations(term).tolist() == pytest.approx(
+        prior_deviations(effect_of("free_scan", SCAN)).tolist()
+    ), "evidence is that of what was likely beforehand"
+
+
+@FORWARD_MODE
+def test_a_ripple_is_begun_with_a_width_of_its_own():
+    ripple = with_one("free_scan", 39, 0.1)
+    found = {c.name: c for c in planted(ripple, seed=2)}
+    relative, octave = found["free_scan"].effect.relative, ripple.octave
+    assert relative[octave == octave[39]].min() > 3 * relative[octave != octave[39]].max()
 
 
 def test_rows_are_a_fixed_choice_of_the_fitted_ones():
