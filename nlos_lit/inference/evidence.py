@@ -450,10 +450,12 @@ def by_cells(z: Tensor, residual: Tensor, block: Tensor) -> tuple[Tensor, Tensor
         ``[C, k]`` and ``[C, k, k]``, the ``SEGMENTS`` parts of a block one after the other.
 
     Examples:
-        >>> one = torch.ones(2, SEGMENTS, 1)
-        >>> scores, information = by_cells(one, 3 * one[..., 0], torch.tensor([1, 0]))
-        >>> scores[:, 0].tolist(), information.shape
-        ([3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0], torch.Size([8, 1, 1]))
+        Two spots of four bins, of blocks 1 and 0:
+
+        >>> residual = torch.tensor([3.0, 5.0])[:, None].expand(2, 4)
+        >>> scores, information = by_cells(torch.ones(2, 4, 1), residual, torch.tensor([1, 0]))
+        >>> scores.view(2, SEGMENTS).sum(1).tolist(), information.view(2, SEGMENTS).sum(1).tolist()
+        ([20.0, 12.0], [4.0, 4.0])
     """
     order, sizes = block.argsort(stable=True), torch.bincount(block).tolist()
     parts = [
