@@ -314,12 +314,13 @@ def evidence(
     values = values.clamp_min(1e-12 * float(values[-1].clamp_min(1e-30)))
     u, tried = s.sum(0) @ vectors, torch.from_numpy(VARIANCES)[:, None]
 
+    def within(mean: Tensor, bounds: tuple[Tensor, Tensor] | None) -> Tensor:
+        return mean if bounds is None else mean.clamp(bounds[0] / deviation, bounds[1] / deviation)
+
     def best(scatter: Tensor, bounds: tuple[Tensor, Tensor] | None) -> tuple[float, float, Tensor]:
         """Nats, τ² and the coefficients ``[k]``, where the likelihood counts as its φ-th root."""
         grown = 1 + tried * values / scatter
-        mean = (tried * u / scatter / grown) @ vectors.T
-        if bounds is not None:
-            mean = mean.clamp(bounds[0] / deviation, bounds[1] / deviation)
+        mean = within((tried * u / scatter / grown) @ vectors.T, bounds)
         along = mean @ vectors
         gain = (along * u - 0.5 * values * along**2) / scatter - 0.5 * along**2 / tried
         nats = (gain - 0.5 * grown.log()).sum(1)
@@ -336,8 +337,7 @@ def evidence(
     if octave is not None and nats > 0:
         score, information = s.sum(0) / mean_scatter, f.sum(0) / mean_scatter
         mean, relative = by_octave(score, information, octave, variance)
-        if bounds is not None:
-            mean = mean.clamp(bounds[0] / deviation, bounds[1] / deviation)
+        mean = within(mean, bounds)
     whole = (raw.square().sum(1).double().sum(0) * deviation**2).clamp_min(1e-30)
     return Evidence(
         nats=nats,
