@@ -90,10 +90,11 @@ def ring(
 def flank(
     centre: Tensor, normal: Tensor, curvature: Tensor, source: Tensor, cell: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """How sheets go on where they become too steep for a lattice of lateral cells: the sides of round bodies.
+    """How sheets go on where they become too steep for a lattice of lateral cells: the sides of round bodies,
+    and those of bowls.
 
-    One patch beyond each surfel, down from the wall, on a surface that goes on curving as it does there. A
-    patch that stands steeply is as long as one that leans just enough to cover its cell.
+    One patch beyond each surfel, away from the wall, and one towards it, on a surface that goes on curving as
+    it does there. A patch that stands steeply is as long as one that leans just enough to cover its cell.
 
     Args:
         centre: ``[M, 3]`` m.
@@ -106,7 +107,8 @@ def flank(
         centres and normals of those that are steep, and which surfel each goes on from.
 
     Examples:
-        A cylinder of radius 0.2 along y, from a surfel that leans by 60°:
+        A cylinder of radius 0.2 along y, from a surfel that leans by 60°, and the inside of one, which is
+        steep towards the wall:
 
         >>> leaning = torch.tensor([[0.75**0.5, 0.0, -0.5]])
         >>> along = torch.tensor([[0.5, 0.0, 0.75**0.5]])
@@ -115,12 +117,16 @@ def flank(
         >>> place, facing, _ = flank(0.2 * leaning, leaning, bend, *both)
         >>> round(float(place.norm()), 3), round(float(facing[0, 2]), 2)
         (0.2, -0.3)
+        >>> place, facing, _ = flank(-0.2 * leaning, leaning, -bend, *both)
+        >>> round(float(place.norm()), 3), float(place[0, 2]) < 0.1
+        (0.2, True)
     """
     down = torch.tensor([0.0, 0.0, 1.0], device=centre.device) - normal[:, 2:] * normal
     leans = down.norm(dim=1, keepdim=True)
     source = source & (leans[:, 0] > 1e-3)
     c, n, k = centre[source], normal[source], curvature[source]
     way, side = (down / leans.clamp_min(1e-3))[source], float(cell.max())
+    c, n, k, way = (torch.cat(both) for both in ((c, c), (n, n), (k, k), (way, -way)))
 
     def length(facing: Tensor) -> Tensor:
         return side / (-facing[:, 2:]).clamp_min(STEEP)
@@ -131,7 +137,7 @@ def flank(
     place, facing = c + shift[:, 0], facing[:, 0]
     turn = (facing * n).sum(1).clamp(-1, 1).acos()
     steep = (-facing[:, 2] < STEEP) & (facing[:, 2] < BACK) & (turn < TURN)
-    return place[steep], facing[steep], torch.nonzero(source)[:, 0][steep]
+    return place[steep], facing[steep], torch.nonzero(source)[:, 0].repeat(2)[steep]
 
 
 def _near(places: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:

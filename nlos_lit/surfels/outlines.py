@@ -33,7 +33,7 @@ CHUNK = 1 << 20  # paths at a time
 
 @torch.no_grad()
 def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
-    """Go on with all sheets by ``RINGS`` rings of cells, and down their flanks, within the grid's depths.
+    """Go on with all sheets by ``RINGS`` rings of cells, and along their flanks, within the grid's depths.
 
     They hide nothing, and are hidden by what is there. Flanks go on from surfels that are there, since only
     their curvature is known.

@@ -118,24 +118,29 @@ def of_cylinder(degrees: list[float], radius: float = 0.3) -> tuple[torch.Tensor
     return at, normal, along[:, :, None] * along[:, None] / radius
 
 
-def test_flanks_go_on_where_the_next_patch_is_steep():
+@pytest.mark.parametrize("bulge", [1.0, -1.0])
+def test_flanks_go_on_where_the_next_patch_is_steep(bulge):
     """The last surfel before 66° goes on, one at 30° does not: the next lateral cell is as good. Going on
-    from what was begun leads round the cylinder, and ends where its back faces away from the wall.
+    from what was begun leads round a cylinder, away from the wall, or up the inside of one, towards it, and
+    ends where its back faces away from the wall; or back to where it came from.
     """
     cell, radius = torch.tensor([0.03, 0.03]), 0.3
+    axis = torch.tensor([0.1, 0.0, 0.8])
     at, normal, curvature = of_cylinder([-30.0, 30.0, 60.0])
-    found, reached = [], [60.0]
-    source = torch.ones(3, dtype=torch.bool)
-    while len(at):
-        at, normal, which = flank(at, normal, curvature, source, cell)
+    at, curvature = axis + bulge * (at - axis), bulge * curvature
+    reached, source, known = [60.0], torch.ones(3, dtype=torch.bool), at
+    while True:
+        place, normal, which = flank(at, normal, curvature, source, cell)
+        onward = bulge * (place[:, 2] - at[which][:, 2]) > 0
+        assert torch.cdist(place[~onward], known).min(1).values.le(0.01).all()
+        if not onward.any():
+            break
+        assert int(onward.sum()) == 1
+        known, at, normal = torch.cat([known, place[onward]]), place[onward], normal[onward]
         along = torch.stack([-normal[:, 2], 0 * normal[:, 2], normal[:, 0]], 1)
-        curvature, source = along[:, :, None] * along[:, None] / radius, source[which]
-        found.append(len(at))
-        if len(at):
-            reached.append(float(torch.rad2deg(torch.atan2(normal[0, 0], -normal[0, 2]))))
-            away = (at[0] - torch.tensor([0.1, 0.0, 0.8])).norm()
-            assert abs(float(away) - radius) < 0.012
-    assert found == [1] * (len(reached) - 1) + [0]
+        curvature, source = bulge * along[:, :, None] * along[:, None] / radius, source[which[onward]]
+        reached.append(float(torch.rad2deg(torch.atan2(normal[0, 0], -normal[0, 2]))))
+        assert abs(float((at[0] - axis).norm()) - radius) < 0.012
     assert reached[-1] < 90 + math.degrees(math.asin(BACK))
     assert reached == sorted(reached)
     assert reached[-1] > 85
