@@ -15,7 +15,7 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.words import EffectWords
 
-HOT = 0.25  # of the hottest spot: from there on a spot counts as hot
+HOT = 3.0  # standard errors of its background, by which a spot must exceed the others to count as hot
 
 
 class HotSpots(Effect):
@@ -24,7 +24,8 @@ class HotSpots(Effect):
     ``background → background + extra_s``, extra ≥ 0 and 0 at most spots
 
     Parameters: ``extra`` (counts/bin), one for each spot, null 0. Quantities ``level`` (counts/bin, mean of
-    the hot spots) and ``number`` (1): spots of at least a quarter of the hottest one's extra.
+    the hot spots) and ``number`` (1): spots whose light exceeds what most have by three
+    standard errors of counting it.
 
     Signature: single spots with a residual above 0 in all bins alike.
 
@@ -68,14 +69,14 @@ class HotSpots(Effect):
             rng: for the spots and their shares of the level.
 
         Raises:
-            UserError: the level is negative or too large, or the number is not one of spots.
+            UserError: the level is negative or too large, or the number is not one of a few spots.
         """
         values, spots = {**self.typical(self.scan), **values}, self.scan.n_spots
         level, number = self.given_size(values, "level"), values["number"]
-        if number != int(number) or not 1 <= number <= spots:
+        if number != int(number) or not 1 <= number <= spots // 2:
             raise UserError(
-                f"hot_spots.number must be a whole number from 1 to the scan's {spots} spots;"
-                f" found {number:g}"
+                f"hot_spots.number must be a whole number from 1 to {spots // 2}, half of the scan's spots; "
+                f"found {number:g}"
             )
         extra = torch.zeros(spots)
         share = rng.uniform(0.5, 1.5, int(number))
@@ -88,9 +89,12 @@ class HotSpots(Effect):
 
     def quantities(self) -> dict[str, Quantity]:
         extra = self.value("extra").reshape(-1)
-        hot = ((extra > 0) & (extra >= HOT * extra.max())).detach().to(extra.dtype)
+        usual = extra.detach().median()  # a fit may give a part of the background to all spots
+        error = ((self.scan.background + usual) / self.scan.n_bins).sqrt()
+        above = extra - usual
+        hot = (above > HOT * error).detach().to(extra.dtype)
         number = hot.sum()
         return {
-            "level": Quantity((extra * hot).sum() / number.clamp_min(1), "counts/bin"),
+            "level": Quantity((above * hot).sum() / number.clamp_min(1), "counts/bin"),
             "number": Quantity(number, "1", spots=True),
         }

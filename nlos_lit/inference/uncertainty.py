@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -130,13 +131,23 @@ def e_size(effect: Effect) -> int:
 def _spread(effect: Effect, share: float) -> dict[str, Estimate]:
     """Of a per-spot effect, from the spots that have a number.
 
-    ``share`` of all spots were fitted; numbers of spots are for all.
+    ``share`` of all spots were fitted; numbers of spots are for all. Errors are those of the width of a
+    normal distribution, or by leaving out each spot (the jackknife), where that is more: some numbers are far
+    from normal.
     """
-    known = max(1, int((getattr(effect, f"raw_{effect.amplitudes[0].name}") != 0).sum()))
+    without, left_out = copy.deepcopy(effect), []
+    raw = getattr(without, f"raw_{effect.amplitudes[0].name}").data
+    known = torch.nonzero(raw)[:, 0].tolist()
+    for spot in known:
+        number, raw[spot] = float(raw[spot]), 0.0
+        left_out.append(_values(without))
+        raw[spot] = number
+    n = max(1, len(known))
     found = {}
     for name, quantity in effect.quantities().items():
-        value = float(quantity.value.detach())
-        error = value**0.5 if quantity.spots else value / (2 * known) ** 0.5
+        value, others = float(quantity.value.detach()), [values[name] for values in left_out]
+        away = (n - 1) ** 0.5 * float(np.std(others)) if others else 0.0
+        error = value**0.5 if quantity.spots else max(value / (2 * n) ** 0.5, away)
         scale = share if quantity.spots else 1.0
         found[name] = Estimate(value / scale, error / scale, quantity.unit)
     return found

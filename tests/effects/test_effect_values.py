@@ -17,6 +17,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.ghost_pulse import repeats_after
+from nlos_lit.effects.hot_spots import HOT
 from nlos_lit.effects.scan_pieces import lines
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
@@ -284,6 +285,18 @@ def test_backgrounds():
     assert ambient.background(level, spots)[:, 0].detach() == pytest.approx(
         2 * torch.exp(ambient.field()[spots]).detach(), rel=1e-5
     )
+
+
+@pytest.mark.parametrize("usual", [0.0, 1.0])
+def test_spots_are_hot_that_exceed_the_others_by_three_errors_of_their_background(usual):
+    """What all spots have is their background, whichever of both a fit gives it to."""
+    none = effect("hot_spots")
+    error = ((none.scan.background + usual) / none.scan.n_bins) ** 0.5
+    extra = torch.full((SPOTS,), usual)
+    extra[:3] += torch.tensor([30.0, HOT + 0.1, HOT - 0.1]) * error
+    found = effect("hot_spots", extra=extra).quantities()
+    assert found["number"].value == 2
+    assert found["level"].value.item() == pytest.approx((30 + HOT + 0.1) / 2 * error, rel=1e-4)
 
 
 def test_hum_swings_in_the_order_of_acquisition():

@@ -121,12 +121,22 @@ def test_a_width_is_as_certain_as_its_spots_are_many():
 
 
 def test_hot_spots_are_counted_for_the_whole_scan():
-    """Nine of 2 counts a bin among the fitted three quarters: twelve ± √9/0.75; their level is 2."""
+    """Three of 2 counts a bin among the fitted three quarters: four ± √3/0.75; their level is 2."""
     extra = torch.zeros(12)
-    extra[:9] = 2.0
+    extra[:3] = 2.0
     found = known([], torch.zeros(0, 0)).parameters(effect_of("hot_spots", SCAN, extra=extra))
-    assert (found["number"].value, found["number"].stderr) == (pytest.approx(12), pytest.approx(4))
-    assert (found["level"].value, found["level"].stderr) == (pytest.approx(2), pytest.approx(2 / 18**0.5))
+    assert (found["number"].value, found["number"].stderr) == (pytest.approx(4), pytest.approx(3**0.5 / 0.75))
+    assert (found["level"].value, found["level"].stderr) == (pytest.approx(2), pytest.approx(2 / 6**0.5))
+
+
+def test_a_mean_of_unlike_spots_is_as_uncertain_as_they_scatter():
+    """Of 20, 2, 2 and 2 counts a bin the mean is 6.5 ± 4.5, the standard error of a mean of four."""
+    extra = torch.zeros(12)
+    extra[:4] = torch.tensor([20.0, 2.0, 2.0, 2.0])
+    effect = effect_of("hot_spots", SCAN, extra=extra)
+    found = known([], torch.zeros(0, 0)).parameters(effect)["level"]
+    assert (found.value, found.stderr) == (pytest.approx(6.5), pytest.approx(4.5))
+    assert torch.equal(effect.value("extra").reshape(-1), extra)
 
 
 def accepted_fit(factor: float = 1.0, seed: int | None = 0) -> tuple[SurfelFit, Tensor, Tensor]:

@@ -157,7 +157,7 @@ def test_one_amplitude_given_leaves_the_others_at_their_null(scan):
         (["pile_up"], {"pile_up.detections": math.nan}, "must keep within"),
         (["power_drift"], {"power_drift.rms": 9.0}, "in the field drawn"),
         (["time_drift"], {"time_drift.rms": -1.0}, "must be 0 or more"),
-        (["hot_spots"], {"hot_spots.number": 2.5}, "whole number from 1 to the scan's 120 spots"),
+        (["hot_spots"], {"hot_spots.number": 2.5}, "whole number from 1 to 60, half of the scan's spots"),
     ],
 )
 def test_values_that_make_no_sense_are_explained(scan, names, values, words):
