@@ -67,8 +67,11 @@ class Confirmed:
 
     @property
     def much(self) -> bool:
-        """Spots that were not fitted are predicted much better with it."""
-        return self.explained > MUCH and self.weight > SURE
+        """Spots that were not fitted are predicted much better with it, and not a few of them alone: by a
+        standard error less, too.
+        """
+        least = self.gain.nats - self.gain.error
+        return self.explained * least > MUCH * self.gain.nats > 0 and self.weight > SURE
 
     def holds(self, candidate: Candidate) -> bool:
         """By its own evidence, which other spots do not contradict.

@@ -28,7 +28,7 @@ from nlos_lit.inference.criticise import (
     criticise,
     misfit_of,
 )
-from nlos_lit.inference.heldout import compare
+from nlos_lit.inference.heldout import Comparison, compare
 from nlos_lit.inference.members import Confirmed, Findings, Member, Trial, chosen, group_of, weighed
 from nlos_lit.inference.pool import Candidate, Pool, Taken, foreign
 
@@ -725,6 +725,14 @@ def test_what_is_predicted_much_better_is_told(monkeypatch, gain, more, told):
     assert (found["irf_tail"].accepted, found["irf_tail"].likely) == (False, told)
     open_ = replace(found["irf_tail"].confirmed, weight=0.94)
     assert not replace(found["irf_tail"], confirmed=open_).likely
+
+
+@pytest.mark.parametrize(("error", "much"), [(37.0, True), (38.0, False)])
+def test_what_a_few_spots_gain_is_not_much(error, much):
+    """Of 100 ± 37.5 nats that are 40 % of what is unexplained a quarter is left by a standard error less."""
+    found = Confirmed(1.0, 10.0, Comparison(100.0, error, (0.0, 200.0)), 1.0, explained=0.4)
+    assert (found.much, found.holds(candidate("free_time"))) == (much, much)
+    assert not replace(found, gain=Comparison(-100.0, error, (-200.0, 0.0)), explained=-0.4).much
 
 
 @pytest.mark.parametrize(("gain", "accepted"), [(10.1, True), (9.9, False)])
