@@ -168,6 +168,15 @@ class Effect(nn.Module, Hooks):
             getattr(self, f"raw_{p.name}").add_(step[: p.size])
             step = step[p.size :]
 
+    def step_bounds(self) -> tuple[Tensor, Tensor]:
+        """``[k]`` least and largest steps of the stored amplitudes from their nulls."""
+        lower, upper = [], []
+        for p in self.amplitudes:
+            assert p.null is not None  # what makes an amplitude
+            lower.append(torch.full((p.size,), (p.lower - p.null) / p.scale))
+            upper.append(torch.full((p.size,), (p.upper - p.null) / p.scale))
+        return torch.cat(lower).double(), torch.cat(upper).double()
+
     def is_meant(self, step: Tensor) -> bool:
         """Whether the effect is still what its name says.
 
@@ -238,6 +247,18 @@ class Effect(nn.Module, Hooks):
 
         Args:
             asked: what the counts ask of each path's light.
+
+        Returns:
+            as of :meth:`shape_grid`.
+        """
+        return self.shape_grid()
+
+    def likely_in_time(self, excess: Tensor, light: Tensor) -> list[dict[str, float]]:
+        """The same of an effect that does not act on single paths.
+
+        Args:
+            excess: ``[T_gate]`` counts over the expected ones, of all spots together.
+            light: ``[T_gate]`` expected counts of all spots together.
 
         Returns:
             as of :meth:`shape_grid`.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,25 +14,30 @@ from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.smooth import length
 from nlos_lit.effects.words import EffectWords
 
-MOST_PERIODS = 200
+WAVES = 8  # of a pattern: any of up to 16 widths
+MOST_PERIODS = 2000
+LIKELY = 8  # periods that are worth a test
 
 
 class TcspcNonlinearity(Effect):
-    """Bin widths ripple along the record: differential non-linearity of the time-to-digital converter.
+    """Bin widths repeat along the record: differential non-linearity of the time-to-digital converter.
 
-    ``m'_t = m_t (1 + sine · sin(2πt/P) + cosine · cos(2πt/P))``, t the bin number.
+    ``m'_t = m_t (1 + Σ_k (s_k sin(2πkt/P) + c_k cos(2πkt/P)))``, t the bin number, k from 1 to 8 while half a
+    period of the k-th wave is a bin.
 
-    Parameters: ``sine``, ``cosine`` (1), null 0. ``period`` P (bins), scanned uniformly in 1/P from 1/40 (or
-    two periods in the gate) to 1/2.2, with steps of 1/(1.5 gate) but at most 200 values. Quantities
-    ``amplitude`` (1, the root of both squares) and ``period`` (bins).
+    Parameters: ``sine`` s_1, ``cosine`` c_1 (1), null 0. ``overtones`` s_2, c_2, … s_8, c_8 (1), null 0: each
+    octave is as likely as the first wave. ``period`` P (bins), scanned from 40 (or half the gate) to 2.2, so
+    densely that no wave is off by more than a sixth of its period at either end of the gate, but at most 2000
+    values. Quantities ``rms`` of the widths (1) and ``period`` (bins).
 
-    Signature: a ripple in time at all spots, in phase with the bin number and not with the arrival; also in
-    the background.
+    Signature: the same pattern in time at all spots, in phase with the bin number and not with the arrival;
+    also in the background.
 
     Degenerate with: ``background_slope`` for periods beyond the gate; with nothing else.
 
     Source: D. V. O'Connor, D. Phillips, *Time-correlated Single Photon Counting*, 1984 (differential
-    non-linearity).
+    non-linearity). Widths of single codes that repeat with the interpolator: J. Kalisz, *Review of methods
+    for time interval measurements with picosecond resolution*, Metrologia 41, 2004.
     """
 
     name = "tcspc_nonlinearity"
@@ -41,7 +47,7 @@ class TcspcNonlinearity(Effect):
         cause="The timing electronics' bins are not equally wide; the pattern repeats with the "
         "interpolator's period.",
         remedy="Record a flat histogram with steady light and divide by it.",
-        headline="{amplitude} with a period of {period}",
+        headline="{rms} rms with a period of {period}",
     )
 
     @classmethod
@@ -49,12 +55,22 @@ class TcspcNonlinearity(Effect):
         width = scan.gate[1] - scan.gate[0]
         high = 1 / 2.2
         low = min(max(1 / 40, 2 / width), high / 2)
-        n = min(MOST_PERIODS, math.ceil((high - low) * 1.5 * width) + 1)
-        periods = tuple(1 / (low + (high - low) * k / (n - 1)) for k in range(n))
+        frequencies = [low]
+        while frequencies[-1] < high:
+            highest = min(WAVES, max(1.0, 0.5 / frequencies[-1]))
+            frequencies.append(frequencies[-1] + 1 / (1.5 * width * highest))
+        n = min(MOST_PERIODS, len(frequencies))
+        places = np.linspace(0, len(frequencies) - 1, n)
+        even = np.interp(places, np.arange(len(frequencies)), [*frequencies[:-1], high])
         waves = tuple(
             Parameter(name, "1", 0.0, 0.02, -0.7, 0.7, kind="percent") for name in ("sine", "cosine")
         )
-        return (*waves, Parameter("period", "bins", None, 0.01, 2.0, 50.0, grid=periods, log=True))
+        falling = tuple(0.02 / k**0.5 for k in range(2, WAVES + 1) for _ in range(2))
+        overtones = Parameter(
+            "overtones", "1", 0.0, 0.02, -0.3, 0.3, size=len(falling), prior=falling, kind="percent"
+        )
+        periods = tuple((1 / even).tolist())
+        return (*waves, overtones, Parameter("period", "bins", None, 0.01, 2.0, 50.0, grid=periods, log=True))
 
     @classmethod
     def typical(cls, scan: Scan) -> dict[str, float]:
@@ -62,14 +78,63 @@ class TcspcNonlinearity(Effect):
 
     def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
         bins = torch.arange(expected.shape[1], dtype=expected.dtype, device=expected.device)
-        phase = 2 * math.pi * bins / self.value("period")
-        return expected * (
-            1 + self.value("sine") * torch.sin(phase) + self.value("cosine") * torch.cos(phase)
-        )
+        return expected * (1 + self.pattern(bins)).clamp_min(0)
+
+    def pattern(self, bins: Tensor) -> Tensor:
+        """``[T]`` how much wider bins are than the mean, at their numbers ``[T]``."""
+        first = torch.stack([self.value("sine"), self.value("cosine")])
+        return waves_at(bins, self.value("period")) @ torch.cat([first, self.value("overtones")])
+
+    def likely_in_time(self, excess: Tensor, light: Tensor) -> list[dict[str, float]]:
+        """Those periods that beat both their neighbours, by what single waves alone would be worth."""
+        first, last = self.scan.gate
+        bins = torch.arange(first, last, dtype=torch.float64)
+        excess, light = excess.double().cpu(), light.double().cpu()
+        deviation = torch.cat([torch.full((2,), 0.02), torch.tensor(self.declared["overtones"].prior)])
+        variance = deviation.double().square() * torch.logspace(-3, 3, 13, dtype=torch.float64)[:, None]
+        worth, grid = list[Tensor](), torch.tensor(self.declared["period"].grid, dtype=torch.float64)
+        for periods in grid.split(64):
+            waves = waves_at(bins, periods[:, None])
+            score = torch.einsum("ptk,t->pk", waves, excess)[:, None]
+            told = 1 + variance * torch.einsum("ptk,t->pk", waves.square(), light)[:, None]
+            worth.append(0.5 * (variance * score.square() / told - told.log()).sum(2).amax(1))
+        nats = torch.nn.functional.pad(torch.cat(worth), (1, 1), value=-math.inf)
+        peaks = ((nats[1:-1] >= nats[:-2]) & (nats[1:-1] > nats[2:])).nonzero()[:, 0]
+        best = peaks[nats[1:-1][peaks].argsort(descending=True)][:LIKELY]
+        return [{"period": float(grid[k])} for k in best]
+
+    def settable(self) -> dict[str, str]:
+        return {name: unit for name, unit in super().settable().items() if name != "overtones"}
 
     def quantities(self) -> dict[str, Quantity]:
-        waves = torch.stack([self.value("sine"), self.value("cosine")])
+        first, last = self.scan.gate
+        pattern = self.pattern(
+            torch.arange(first, last, dtype=torch.float32, device=self.value("period").device)
+        )
         return {
-            "amplitude": Quantity(length(waves, 0.02), "1", kind="percent"),
+            "rms": Quantity(length(pattern / (last - first) ** 0.5, 0.02), "1", kind="percent"),
             "period": Quantity(self.value("period"), "bins"),
         }
+
+
+def waves_at(bins: Tensor, period: Tensor) -> Tensor:
+    """Waves of a pattern that repeats.
+
+    Those are left out that bins do not tell from others: half a period of theirs is shorter than a bin, by
+    more than a period between two whole numbers may need.
+
+    Args:
+        bins: ``[T]`` numbers.
+        period: ``[…, 1]`` or a scalar, bins.
+
+    Returns:
+        ``[…, T, 16]`` sine and cosine of each.
+
+    Examples:
+        >>> waves_at(torch.arange(4.0), torch.tensor(4.0))[:, :5].abs().round().int().tolist()
+        [[0, 1, 0, 1, 0], [1, 0, 0, 1, 0], [0, 1, 0, 1, 0], [1, 0, 0, 1, 0]]
+    """
+    k = torch.arange(1, WAVES + 1, dtype=bins.dtype, device=bins.device)
+    phase = 2 * math.pi * (bins / period)[..., None] * k
+    told = (k <= period[..., None] / 2 + 0.25).to(bins.dtype)
+    return torch.stack([torch.sin(phase) * told, torch.cos(phase) * told], -1).flatten(-2)

@@ -271,16 +271,6 @@ def prior_deviations(effect: Effect) -> Tensor:
     return torch.cat(known).double()
 
 
-def step_bounds(effect: Effect) -> tuple[Tensor, Tensor]:
-    """``[k]`` least and largest steps of the stored amplitudes from their nulls."""
-    lower, upper = [], []
-    for p in effect.amplitudes:
-        assert p.null is not None  # what makes an amplitude
-        lower.append(torch.full((p.size,), (p.lower - p.null) / p.scale))
-        upper.append(torch.full((p.size,), (p.upper - p.null) / p.scale))
-    return torch.cat(lower).double(), torch.cat(upper).double()
-
-
 def evidence(
     raw: Tensor,
     z: Tensor,
@@ -338,13 +328,14 @@ def evidence(
         score, information = s.sum(0) / mean_scatter, f.sum(0) / mean_scatter
         mean, relative = by_octave(score, information, octave, variance)
         mean = within(mean, bounds)
-    whole = (raw.square().sum(1).double().sum(0) * deviation**2).clamp_min(1e-30)
+    whole = raw.square().sum(1).double().sum(0) * deviation**2
+    does = whole > 1e-12 * whole.max()  # coefficients that change anything at this shape
     return Evidence(
         nats=nats,
         scale=variance**0.5,
         step=(mean * deviation).float(),
         error=((vectors.square() @ (scatter / values)).sqrt() * deviation).float(),
-        retained=float((f.sum(0).diagonal() / whole).mean()),
+        retained=float((f.sum(0).diagonal() / whole)[does].mean()) if bool(does.any()) else 0.0,
         scatter=mean_scatter,
         loud=loud,
         relative=relative,

@@ -27,7 +27,6 @@ from nlos_lit.inference.evidence import (
     best_evidence,
     lit_share,
     prior_deviations,
-    step_bounds,
 )
 from nlos_lit.inference.per_spot import best_width, coefficients, neighbours, own_part, sparse
 from nlos_lit.inference.problem import (
@@ -39,7 +38,7 @@ from nlos_lit.inference.problem import (
     weighted_columns,
 )
 from nlos_lit.inference.split import Split
-from nlos_lit.surfels.effect_start import asked_of
+from nlos_lit.surfels.effect_start import likely
 from nlos_lit.surfels.fit import SurfelFit
 
 MOST = 0.9  # of the largest evidence or gain: a simpler term with so much goes before that with the largest
@@ -566,7 +565,7 @@ def _evidence(
     problem: Problem, projector: Projector, effect: Effect, columns: Tensor, freed: Freed, block: Tensor
 ) -> Evidence:
     raw = columns.reshape(*problem.expected.shape, -1)
-    prior = prior_deviations(effect), step_bounds(effect), effect.octave
+    prior = prior_deviations(effect), effect.step_bounds(), effect.octave
     found = best_evidence(projector, raw, freed, block, *prior)
     return found if effect.is_meant(found.step) else replace(found, nats=0.0, loud=0.0)
 
@@ -659,11 +658,8 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
 
 def _shapes(problem: Problem, projector: Projector, effect: Effect) -> list[Shape]:
     """Those that the effect itself thinks likely."""
-    if not effect.needs_paths or not effect.shapes:
-        return effect.shape_grid()
-    excess = projector.residual[: problem.expected.numel()].view_as(problem.expected)
-    asked = asked_of(problem.model, problem.extension, problem.spots, excess, problem.expected)
-    return effect.likely_shapes(asked)
+    over = projector.residual[: problem.expected.numel()].view_as(problem.expected) * problem.expected.sqrt()
+    return likely(problem.model, problem.extension, problem.spots, effect, over, problem.expected)
 
 
 def _per_spot(problem: Problem, projector: Projector, effect: Effect) -> Candidate:

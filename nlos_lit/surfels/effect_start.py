@@ -41,6 +41,28 @@ def asked_of(
     return Asked(spots, model.centre().detach(), -score, amount)
 
 
+def likely(
+    model: SurfelModel, extension: Extension, spots: Tensor, effect: Effect, over: Tensor, expected: Tensor
+) -> list[dict[str, float]]:
+    """Shapes of an effect that are worth a test.
+
+    Args:
+        model: the surfels.
+        extension: effects.
+        spots: ``[B]`` rows of the capture.
+        effect: whose they are.
+        over: ``[B, T_gate]`` counts over the expected ones.
+        expected: ``[B, T_gate]``.
+
+    Returns:
+        as of :meth:`~nlos_lit.effects.effect.Effect.shape_grid`.
+    """
+    if not effect.shapes or not effect.needs_paths:
+        return effect.likely_in_time(over.sum(0), expected.sum(0))
+    with torch.enable_grad():
+        return effect.likely_shapes(asked_of(model, extension, spots, over * expected.rsqrt(), expected))
+
+
 @torch.no_grad()
 def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, counts: Tensor) -> None:
     """Set every effect that has scanned parameters to the best of its grid, its amplitudes to a scoring step.
@@ -70,35 +92,27 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
             continue
         effect.reset()
         base = expected(effect, light)
-        nulls = {p.name: p.null or 0.0 for p in effect.amplitudes}
         excess = counts / base - 1
-        with torch.enable_grad():
-            asked = asked_of(model, extension, spots, excess * base.sqrt(), base)
-        best, most = {}, 0.0
-        for shape in effect.likely_shapes(asked):
+        precision = effect.precision().double().to(counts.device)
+        low, high = (bound.to(counts.device) for bound in effect.step_bounds())
+        best, by, most = dict[str, float](), torch.zeros_like(low), 0.0
+        for shape in likely(model, extension, spots, effect, counts - base, base):
             effect.set_all(shape)
             columns = []
-            for p in effect.amplitudes:
-                effect.set(p.name, nulls[p.name] + p.scale)
-                columns.append((expected(effect, light) - base) / p.scale)
-                effect.set(p.name, nulls[p.name])
+            for unit in torch.eye(len(low), device=counts.device):
+                effect.shift(unit)
+                columns.append(expected(effect, light) - base)
+                effect.shift(-unit)
             sensitivity = torch.stack(columns).flatten(1).double()
             score = sensitivity @ excess.flatten().double()
-            information = (sensitivity / base.flatten()) @ sensitivity.T
+            information = (sensitivity / base.flatten()) @ sensitivity.T + torch.diag(precision[: len(low)])
             if float(information.diagonal().min()) <= 0:  # nothing in the gate changes
                 continue
-            step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0]
-            low, high = (
-                torch.tensor([getattr(p, b) - nulls[p.name] for p in effect.amplitudes], device=counts.device)
-                for b in ("lower", "upper")
-            )
-            step = step.clamp(low, high)
+            step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0].clamp(low, high)
             gain = float(score @ step - step @ information @ step / 2)
             if gain > most:
-                best = shape | {
-                    p.name: nulls[p.name] + float(x) for p, x in zip(effect.amplitudes, step, strict=True)
-                }
-                most = gain
+                best, by, most = shape, step, gain
         effect.reset()
         effect.set_all(best)
+        effect.shift(by.float())
         light = arriving() if effect.needs_paths else light

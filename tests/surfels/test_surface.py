@@ -222,7 +222,7 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
         scores[scan_shapes] = result.heldout.deviance_per_bin / result.heldout.deviance_noise
         ripple = {name: q.value.item() for name, q in result.extension.effects[0].quantities().items()}
         assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
-    assert ripple["amplitude"] == pytest.approx(0.2, abs=0.03)
+    assert ripple["rms"] == pytest.approx(0.2 / 2**0.5, abs=0.03 / 2**0.5)
     assert scores[True] < scores[False] - 0.02
     assert seen[440:] == [(k, 440) for k in range(1, 441)]
 
