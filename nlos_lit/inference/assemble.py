@@ -158,7 +158,7 @@ def _accepted(
     free = effect if isinstance(effect, Free) else None
     return Accepted(
         name=effect.name,
-        parameters=uncertainty.parameters(effect, again),
+        parameters=uncertainty.parameters(effect, again, confirmed.misfit),
         evidence=confirmed.evidence,
         heldout_gain=_gain(found.final, trial.gain, split),
         weights={name: weight / total for name, weight in weights.items()},

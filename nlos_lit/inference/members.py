@@ -66,6 +66,11 @@ class Confirmed:
     chance: float = 0.0
 
     @property
+    def misfit(self) -> float:
+        """Of what is needed, nats that what the scene cannot follow may give the term."""
+        return max(0.0, self.needed - self.shared - self.chance)
+
+    @property
     def much(self) -> bool:
         """Spots that were not fitted are predicted much better with it, and not a few of them alone: by a
         standard error less, too.

@@ -371,7 +371,7 @@ def own_evidence(
     laws = {n: e for n, e in effects.items() if not e.per_spot}
     columns = {n: weighted_columns(problem, e, shapes=True) for n, e in laws.items()}
     freed = _freed(whole, columns)
-    above = {n: _above_null(e) for n, e in laws.items()}
+    above = {n: above_null(e) for n, e in laws.items()}
     does = {n: freed[n][:, : len(above[n])] @ above[n] for n in laws}
 
     @cache
@@ -421,8 +421,15 @@ def own_evidence(
     return found, enough
 
 
-def _above_null(effect: Effect) -> Tensor:
-    """``[k]`` how far an effect's stored amplitudes lie from their nulls."""
+def above_null(effect: Effect) -> Tensor:
+    """How far an effect's stored amplitudes lie from their nulls.
+
+    Args:
+        effect: of any strength.
+
+    Returns:
+        ``[k]``.
+    """
     return _amplitudes(effect) - _amplitudes(_null_of(effect))
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from nlos_lit.effects.effect import Effect
 from nlos_lit.inference.evidence import Projector
-from nlos_lit.inference.pool import patches_for, tested_rows
+from nlos_lit.inference.pool import above_null, patches_for, tested_rows
 from nlos_lit.inference.problem import build_problem, weighted_columns
 from nlos_lit.inference.result import Estimate
 from nlos_lit.inference.split import Split
@@ -60,7 +60,9 @@ class Uncertainty:
         grow = (robust.diagonal() / inverse.diagonal()).clamp_min(1.0).sqrt()
         self.covariance = share * inverse * grow[:, None] * grow[None, :]
 
-    def parameters(self, effect: Effect, again: Effect | None = None) -> dict[str, Estimate]:
+    def parameters(
+        self, effect: Effect, again: Effect | None = None, misfit: float = 0.0
+    ) -> dict[str, Estimate]:
         """Reported quantities and their errors.
 
         An error is a third of the change over three standard errors along each axis of the covariance, the
@@ -68,9 +70,14 @@ class Uncertainty:
         bends, as the length of a vector does whose largest component is not settled. The width of per-spot
         effects: from the number of spots.
 
+        Counts say nothing of what the scene cannot follow. The nats that a term needs for that before it is
+        named are the same three standard errors, of how much of it there is: by so much all its amplitudes
+        are displaced together, too.
+
         Args:
             effect: one of the fit's.
             again: the same effect in a fit from new seeds; the difference is an error, too.
+            misfit: nats that the scene's misfit may give the effect, at most.
 
         Returns:
             by name of the quantity.
@@ -83,6 +90,9 @@ class Uncertainty:
         )
         steps = REACH * variance.clamp_min(0).sqrt() * axes
         moved = [[_displaced(effect, sign * step) for sign in (1, -1)] for step in steps.T.float()]
+        part = slice(offset, offset + sum(p.size for p in effect.amplitudes))
+        towards = _more_of(effect, self.covariance[part, part], misfit)
+        moved.append([_displaced(effect, sign * towards) for sign in (1, -1)])
         elsewhere = {} if again is None else _values(again)
         found = {}
         for name, quantity in effect.quantities().items():
@@ -99,6 +109,15 @@ def _displaced(effect: Effect, step: Tensor) -> dict[str, float]:
     moved.shift(step, shapes=True)
     moved.clamp()
     return _values(moved)
+
+
+def _more_of(effect: Effect, covariance: Tensor, misfit: float) -> Tensor:
+    """Step of all stored values by which there is so many nats more of an effect; twice as much, at most."""
+    amplitudes = above_null(effect).double()
+    variance, axes = torch.linalg.eigh(covariance)
+    told = (axes.T @ amplitudes).square() / variance.clamp_min(1e-12 * float(variance[-1]) + 1e-30)
+    share = min(1.0, math.sqrt(2 * misfit / max(float(told.sum()), 1e-30)))
+    return torch.cat([share * amplitudes, torch.zeros(e_size(effect) - len(amplitudes))]).float()
 
 
 def uncertainty_of(fit: SurfelFit, split: Split, most: int, seed: int) -> Uncertainty:

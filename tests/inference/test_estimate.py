@@ -109,6 +109,19 @@ def test_a_parameter_that_comes_back_elsewhere_is_unsure():
     assert known_slope.parameters(slope, again)["slope"].stderr == pytest.approx(0.5, rel=1e-4)
 
 
+def test_what_a_misfit_may_add_is_three_errors_of_how_much_there_is():
+    """A tail of 0.2, four steps of 0.05 with an error of 0.1: ½ · 40² = 800 nats. Of these 18 are 0.15 of it,
+    three times 0.01; its decay is as sure as before. What has less nats than that may be none, or twice.
+    """
+    tail = effect_of("irf_tail", SCAN, fraction=0.2)
+    covariance = torch.diag(torch.tensor([0.01, 1e-6, 0.01, 1e-6]))
+    by_counts, found, more = (known([tail], covariance).parameters(tail, None, m) for m in (0, 18, 2000))
+    assert by_counts["fraction"].stderr == pytest.approx(0.005, rel=1e-3)
+    assert found["fraction"].stderr == pytest.approx((0.005**2 + 0.01**2) ** 0.5, rel=0.01)
+    assert found["decay"].stderr == pytest.approx(by_counts["decay"].stderr, rel=1e-6)
+    assert more["fraction"].stderr == pytest.approx((0.005**2 + (0.2 / 3) ** 2) ** 0.5, rel=0.01)
+
+
 def test_a_width_is_as_certain_as_its_spots_are_many():
     """Jitter of 8 solved spots of 12: σ/√16."""
     offset = torch.zeros(12)
