@@ -26,7 +26,6 @@ from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.model import Lateral, SurfelModel, spline_sensor
 
 BIN, T_START, GATE, SPOTS = 0.02, 0.62, (6, 64), 10
-EXACT = {"tcspc_nonlinearity"}  # what repeats does so to the last digit
 HOOKS_OF_STAGE = {
     "path": {"path", "transients"},
     "time": {"time", "path", "walls"},
@@ -180,8 +179,7 @@ class EffectContract:
 
     def test_which_free_terms_do_what_it_does(self, built: type[Effect]) -> None:
         assert set(built.followed_by) <= FREE_NAMES
-        none = built.per_spot or built.name in EXACT
-        assert bool(built.followed_by) != none, "but for numbers of single spots there are some"
+        assert bool(built.followed_by) != built.per_spot, "but for numbers of single spots there are some"
 
     def test_typical_strength(self, at_null: Effect) -> None:
         """It can be given, as each of its numbers alone can, and says what was given."""

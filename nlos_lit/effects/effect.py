@@ -53,7 +53,6 @@ class Effect(nn.Module, Hooks):
             have strongly, its "geometry" by places and normals, or its "echoes" by surfels behind the
             surface. A diagnosis also builds a scene with all effects of each kind from the first surfel on.
         followed_by: free terms that can do what it does: they take any values where it follows an equation.
-            None where that is exact, so that such a term must be something else.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
         stage: where it acts, one of ``STAGES``.

@@ -41,6 +41,7 @@ class TcspcNonlinearity(Effect):
     """
 
     name = "tcspc_nonlinearity"
+    followed_by = ("free_time",)
     words = EffectWords(
         phrase="time bins of unequal width",
         cause="The timing electronics' bins are not equally wide; the pattern repeats with the "
