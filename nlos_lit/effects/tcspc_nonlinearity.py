@@ -17,6 +17,9 @@ from nlos_lit.effects.words import EffectWords
 WAVES = 8  # of a pattern: any of up to 16 widths
 MOST_PERIODS = 2000
 LIKELY = 8  # periods that are worth a test
+MOST = (
+    0.9  # of the largest worth: a shorter period with so much goes before longer ones, which can do the same
+)
 
 
 class TcspcNonlinearity(Effect):
@@ -86,22 +89,37 @@ class TcspcNonlinearity(Effect):
         return waves_at(bins, self.value("period")) @ torch.cat([first, self.value("overtones")])
 
     def likely_in_time(self, excess: Tensor, light: Tensor) -> list[dict[str, float]]:
-        """Those periods that beat both their neighbours, by what single waves alone would be worth."""
+        """Those that beat both their neighbours, by what single waves alone would be worth.
+
+        What repeats does so after twice its period, too, and a longer one can take up more that is wrong.
+        """
         first, last = self.scan.gate
         bins = torch.arange(first, last, dtype=torch.float64)
         excess, light = excess.double().cpu(), light.double().cpu()
         deviation = torch.cat([torch.full((2,), 0.02), torch.tensor(self.declared["overtones"].prior)])
         variance = deviation.double().square() * torch.logspace(-3, 3, 13, dtype=torch.float64)[:, None]
-        worth, grid = list[Tensor](), torch.tensor(self.declared["period"].grid, dtype=torch.float64)
-        for periods in grid.split(64):
-            waves = waves_at(bins, periods[:, None])
-            score = torch.einsum("ptk,t->pk", waves, excess)[:, None]
-            told = 1 + variance * torch.einsum("ptk,t->pk", waves.square(), light)[:, None]
-            worth.append(0.5 * (variance * score.square() / told - told.log()).sum(2).amax(1))
-        nats = torch.nn.functional.pad(torch.cat(worth), (1, 1), value=-math.inf)
+
+        def worth(periods: Tensor) -> Tensor:
+            found = list[Tensor]()
+            for some in periods.split(64):
+                waves = waves_at(bins, some[:, None])
+                score = torch.einsum("ptk,t->pk", waves, excess)[:, None]
+                told = 1 + variance * torch.einsum("ptk,t->pk", waves.square(), light)[:, None]
+                found.append(0.5 * (variance * score.square() / told - told.log()).sum(2).amax(1))
+            return torch.cat(found)
+
+        grid = np.array(self.declared["period"].grid)
+        nats = torch.nn.functional.pad(worth(torch.from_numpy(grid)), (1, 1), value=-math.inf)
         peaks = ((nats[1:-1] >= nats[:-2]) & (nats[1:-1] > nats[2:])).nonzero()[:, 0]
-        best = peaks[nats[1:-1][peaks].argsort(descending=True)][:LIKELY]
-        return [{"period": float(grid[k])} for k in best]
+        most = peaks[nats[1:-1][peaks].argsort(descending=True)][: 4 * LIKELY].numpy()
+        # What one loses on the grid and another does not would decide between them.
+        beside = most[:, None] + np.linspace(-1, 1, 9)
+        periods = torch.from_numpy(1 / np.interp(beside, np.arange(len(grid)), 1 / grid))
+        peak, place = worth(periods.flatten()).view(periods.shape).max(1)
+        period = periods.gather(1, place[:, None])[:, 0]
+        shortest = period[peak >= MOST * peak.max()].min()
+        best = peak.argsort(descending=True)
+        return [{"period": float(period[k])} for k in best if period[k] <= shortest][:LIKELY]
 
     def settable(self) -> dict[str, str]:
         return {name: unit for name, unit in super().settable().items() if name != "overtones"}

@@ -505,6 +505,20 @@ def test_likely_periods_are_those_that_the_counts_repeat_with():
     assert found[0] == pytest.approx(14, abs=0.03)
     assert 1 < len(found) <= 8
     assert len(set(found)) == len(found)
+    assert max(found) == found[0]
+
+
+def test_the_shortest_period_goes_before_its_multiples():
+    """Three widths beside a light that is wrong in places: twelve could follow some of that."""
+    scan = dataclasses.replace(scene("confocal")[1], gate=(10, 310), n_bins=310)
+    light = torch.full((300,), 1e5, dtype=torch.float64)
+    bins = torch.arange(10, 310, dtype=torch.float64)
+    wrong = 0.004 * torch.sin(2 * math.pi * bins / 12)
+    widths = torch.tensor([0.02, 0.0, -0.02], dtype=torch.float64)[bins.long() % 3]
+    pattern = effect("tcspc_nonlinearity", scan=scan)
+    found = pattern.likely_in_time(light * (widths + wrong), light)
+    assert found[0]["period"] == pytest.approx(3, abs=0.005)
+    assert {round(shape["period"]) for shape in pattern.likely_in_time(light * wrong, light)} >= {12}
 
 
 def test_delays_of_ghosts_are_scanned_densely():
