@@ -25,8 +25,8 @@ MOST = (
 class TcspcNonlinearity(Effect):
     """Bin widths repeat along the record: differential non-linearity of the time-to-digital converter.
 
-    ``m'_t = m_t (1 + Σ_k (s_k sin(2πkt/P) + c_k cos(2πkt/P)))``, t the bin number, k from 1 to 8 while half a
-    period of the k-th wave is a bin.
+    ``m'_t = m_t (1 + Σ_k (s_k sin(2πkt/P) + c_k cos(2πkt/P)))``, t the bin number, k from 1 to 8 where half a
+    period of the k-th wave is a bin or more.
 
     Parameters: ``sine`` s_1, ``cosine`` c_1 (1), null 0. ``overtones`` s_2, c_2, … s_8, c_8 (1), null 0: each
     octave is as likely as the first wave. ``period`` P (bins), scanned from 40 (or half the gate) to 2.2, so

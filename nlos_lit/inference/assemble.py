@@ -82,7 +82,8 @@ def assemble(
 
     uncertainty = uncertain(final)
     terms = {e.name: e for e in final.extension.effects if isinstance(e, Free)}
-    followed = {n: _followed(f, terms[n], uncertain(f.fit), scan) for n, f in followers.items()}
+    misfit = {m.name: m.confirmed.misfit for m in found.accepted if m.confirmed is not None}
+    followed = {n: _followed(f, terms[n], uncertain(f.fit), misfit[n], scan) for n, f in followers.items()}
     accepted = [_accepted(member, found, uncertainty, split, scan, followed) for member in found.accepted]
     named = [a for a in accepted if not a.axis]
     unknown = [a for a in accepted if a.axis]
@@ -129,10 +130,12 @@ def _unnamed(effects: list[Effect]) -> list[str]:
     ]
 
 
-def _followed(follower: Follower, free: Free, uncertainty: Uncertainty, scan: Scan) -> Followed:
+def _followed(
+    follower: Follower, free: Free, uncertainty: Uncertainty, misfit: float, scan: Scan
+) -> Followed:
     formula = next(e for e in follower.fit.extension.effects if e.name == follower.name)
     assert isinstance(formula, Formula)
-    parameters, shape = uncertainty.parameters(formula), shape_of(free, scan)
+    parameters, shape = uncertainty.parameters(formula, None, misfit), shape_of(free, scan)
     curve = laid_through(formula, free, follower.fit, torch.from_numpy(shape.edges).float())
     equation = f"{formula.equation}, x {formula.is_x}"
     told = (follower.name, equation, parameters, follower.share, follower.offered)
@@ -169,6 +172,7 @@ def _accepted(
         formula=followed.get(effect.name),
         needed=confirmed.needed,
         explained=confirmed.explained,
+        misfit=confirmed.misfit,
         tried={name: _tried(name, member.trials, split) for name in weights},
     )
 

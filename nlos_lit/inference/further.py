@@ -207,7 +207,7 @@ class _Asking:
             advised=term.advised if len(order) > 1 else {},
         )
         if first != term.name:
-            stays = replace(stays, name=first, parameters=self._parameters(fits[first], first))
+            stays = replace(stays, name=first, parameters=self._parameters(fits[first], first, term.misfit))
         gained = {n: float(sum(values)) for n, values in here.items()}
         return stays, Further(name, names, gained, kept, seen, share, order)
 
@@ -221,9 +221,10 @@ class _Asking:
         fit = self.base.copy(extension, self.seed)
         return self.steps("fit", f"going on with {name}", name, partial(go_on, fit))
 
-    def _parameters(self, fit: SurfelFit, name: str) -> dict[str, Estimate]:
+    def _parameters(self, fit: SurfelFit, name: str, misfit: float) -> dict[str, Estimate]:
         effect = next(e for e in fit.extension.effects if e.name == name)
-        return uncertainty_of(fit, self.split, self.options.spots, self.seed).parameters(effect)
+        uncertainty = uncertainty_of(fit, self.split, self.options.spots, self.seed)
+        return uncertainty.parameters(effect, None, misfit)
 
 
 def _weights(tried: Mapping[str, Tried]) -> dict[str, float]:

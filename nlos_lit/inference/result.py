@@ -114,6 +114,7 @@ class Accepted:
         advised: nats that captures as long as this one are expected to tell between the term and the rival
             that is hardest to tell from it, by what is done in them, see :mod:`nlos_lit.inference.advise`.
         explained: share that it explains of what held-out spots leave unexplained without it.
+        misfit: of ``needed``, nats that what the scene cannot follow may give it: they count in the errors.
     """
 
     name: str
@@ -129,6 +130,7 @@ class Accepted:
     tried: dict[str, Tried] = field(default_factory=dict)
     advised: dict[str, float] = field(default_factory=dict)
     explained: float = 0.0
+    misfit: float = 0.0
 
     @property
     def confusable_with(self) -> list[str]:

@@ -148,6 +148,7 @@ def test_json_is_the_diagnosis(written, case):
             "needed",
             "tried",
             "explained",
+            "misfit",
         }
         assert all(set(p) == {"value", "stderr", "unit"} for p in effect["parameters"].values())
         assert set(effect["heldout_gain"]) == {
