@@ -93,26 +93,31 @@ def choose_shapes(model: SurfelModel, extension: Extension, spots: Tensor, count
         effect.reset()
         base = expected(effect, light)
         excess = counts / base - 1
-        precision = effect.precision().double().to(counts.device)
-        low, high = (bound.to(counts.device) for bound in effect.step_bounds())
-        best, by, most = dict[str, float](), torch.zeros_like(low), 0.0
+        sizes = [p.size for p in effect.amplitudes]
+        scale = torch.cat([torch.full((p.size,), p.scale, dtype=torch.float64) for p in effect.amplitudes])
+        scale = scale.to(counts.device)
+        precision = effect.precision()[: len(scale)].double().to(counts.device) / scale**2
+        low, high = (bound.to(counts.device) * scale for bound in effect.step_bounds())
+        null = {p.name: p.null or 0.0 for p in effect.amplitudes}
+        best, most = dict[str, float | Tensor](), 0.0
         for shape in likely(model, extension, spots, effect, counts - base, base):
             effect.set_all(shape)
             columns = []
-            for unit in torch.eye(len(low), device=counts.device):
-                effect.shift(unit)
-                columns.append(expected(effect, light) - base)
-                effect.shift(-unit)
+            for p in effect.amplitudes:
+                for unit in p.scale * torch.eye(p.size):
+                    effect.set(p.name, null[p.name] + unit)
+                    columns.append((expected(effect, light) - base) / p.scale)
+                effect.set(p.name, null[p.name])
             sensitivity = torch.stack(columns).flatten(1).double()
             score = sensitivity @ excess.flatten().double()
-            information = (sensitivity / base.flatten()) @ sensitivity.T + torch.diag(precision[: len(low)])
+            information = (sensitivity / base.flatten()) @ sensitivity.T + torch.diag(precision)
             if float(information.diagonal().min()) <= 0:  # nothing in the gate changes
                 continue
             step = torch.linalg.lstsq(information, score[:, None]).solution[:, 0].clamp(low, high)
             gain = float(score @ step - step @ information @ step / 2)
             if gain > most:
-                best, by, most = shape, step, gain
+                each = zip(effect.amplitudes, step.split(sizes), strict=True)
+                best, most = shape | {p.name: null[p.name] + x for p, x in each}, gain
         effect.reset()
         effect.set_all(best)
-        effect.shift(by.float())
         light = arriving() if effect.needs_paths else light
