@@ -13,13 +13,12 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.smooth import length
 from nlos_lit.effects.words import EffectWords
+from nlos_lit.functional.log_factor import log_factor
 
 WAVES = 8  # of a pattern: any of up to 16 widths
 MOST_PERIODS = 2000
 LIKELY = 8  # periods that are worth a test
-MOST = (
-    0.9  # of the largest worth: a shorter period with so much goes before longer ones, which can do the same
-)
+MOST = 0.9  # of the largest worth: a shorter period with so much goes before longer ones
 
 
 class TcspcNonlinearity(Effect):
@@ -97,15 +96,15 @@ class TcspcNonlinearity(Effect):
         bins = torch.arange(first, last, dtype=torch.float64)
         excess, light = excess.double().cpu(), light.double().cpu()
         deviation = torch.cat([torch.full((2,), 0.02), torch.tensor(self.declared["overtones"].prior)])
-        variance = deviation.double().square() * torch.logspace(-3, 3, 13, dtype=torch.float64)[:, None]
+        variance, tried = deviation.double().square(), torch.logspace(-3, 3, 13, dtype=torch.float64)
 
         def worth(periods: Tensor) -> Tensor:
             found = list[Tensor]()
             for some in periods.split(64):
                 waves = waves_at(bins, some[:, None])
-                score = torch.einsum("ptk,t->pk", waves, excess)[:, None]
-                told = 1 + variance * torch.einsum("ptk,t->pk", waves.square(), light)[:, None]
-                found.append(0.5 * (variance * score.square() / told - told.log()).sum(2).amax(1))
+                score = torch.einsum("ptk,t->pk", waves, excess)
+                told = torch.einsum("ptk,t->pk", waves.square(), light)
+                found.append(log_factor(variance * told, variance * score.square(), tried).amax(1))
             return torch.cat(found)
 
         grid = np.array(self.declared["period"].grid)

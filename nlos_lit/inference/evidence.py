@@ -41,32 +41,13 @@ import torch
 from torch import Tensor
 
 from nlos_lit.effects.effect import Effect
+from nlos_lit.functional.log_factor import log_factor
 from nlos_lit.inference.problem import Problem
 
 SEGMENTS = 4  # parts of a wall block along time
 VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
 ROUNDS, LEAST = 30, 0.01  # of widths by octave that are improved, and the least over τ
 UNEVENNESS = np.exp(np.linspace(math.log(2e-3), math.log(0.5), 24))  # u that are tried
-
-
-def log_factor(values: Tensor, squares: Tensor, variances: Tensor) -> Tensor:
-    """Log Bayes factor of random coefficients against none, see the module's equation.
-
-    Args:
-        values: ``[…, k]`` eigenvalues of their information.
-        squares: ``[…, k]`` of their scores in its eigenbasis.
-        variances: ``[V]`` of the coefficients.
-
-    Returns:
-        ``[…, V]`` nats.
-
-    Examples:
-        >>> one = torch.tensor([3.0])
-        >>> [round(v, 3) for v in log_factor(one, one * 16, torch.tensor([0.0, 1.0])).tolist()]
-        [0.0, 5.307]
-    """
-    grown = 1 + variances[:, None] * values[..., None, :]
-    return 0.5 * (variances[:, None] * squares[..., None, :] / grown - grown.log()).sum(-1)
 
 
 class Rows(NamedTuple):

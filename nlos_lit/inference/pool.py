@@ -665,6 +665,8 @@ def _worthwhile(problem: Problem, projector: Projector, effect: Effect) -> list[
 
 def _shapes(problem: Problem, projector: Projector, effect: Effect) -> list[Shape]:
     """Those that the effect itself thinks likely."""
+    if not effect.shapes:
+        return effect.shape_grid()
     over = projector.residual[: problem.expected.numel()].view_as(problem.expected) * problem.expected.sqrt()
     return likely(problem.model, problem.extension, problem.spots, effect, over, problem.expected)
 

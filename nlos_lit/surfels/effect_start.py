@@ -57,7 +57,7 @@ def likely(
     Returns:
         as of :meth:`~nlos_lit.effects.effect.Effect.shape_grid`.
     """
-    if not effect.shapes or not effect.needs_paths:
+    if not effect.needs_paths:
         return effect.likely_in_time(over.sum(0), expected.sum(0))
     with torch.enable_grad():
         return effect.likely_shapes(asked_of(model, extension, spots, over * expected.rsqrt(), expected))
