@@ -24,6 +24,7 @@ EFFECTS = Registry(
         "wall_tilt",
         "wall_scale",
         "laser_sensor_baseline",
+        "scene_motion",
         "time_drift",
         "line_delay",
         "timing_jitter",

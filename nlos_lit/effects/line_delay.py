@@ -29,7 +29,7 @@ class LineDelay(SmoothEffect):
     Signature: residuals of both signs at edges in time, all of one line with the same sign, neighbouring
     lines unrelated.
 
-    Degenerate with: ``time_drift`` where it is smooth over many lines; an object that moves during the scan.
+    Degenerate with: ``time_drift`` where it is smooth over many lines; ``scene_motion``.
 
     Source: W. Becker, *The bh TCSPC Handbook* (synchronisation with a scanner's line clock).
     """

@@ -21,7 +21,7 @@ FEW = 4  # spots for each spline of those
 
 class SmoothEffect(Effect):
     """One parameter, the coefficients ``c`` of ``f(s) = Σ_k c_k b_k(s)``; the b_k average to zero with mean
-    square 1 over the scan.
+    square 1 over the scan. Where f is a vector, each function has a coefficient for each component.
 
     The rougher a b_k, the smaller its coefficient is taken to be (prior): deviation ``likely`` of the
     smoothest, falling with a power of the frequency. Without it, coefficients that the fitted spots hardly
@@ -29,6 +29,7 @@ class SmoothEffect(Effect):
 
     Attributes:
         coefficients: name of the parameter.
+        components: of f, J; 1 where it is a number.
         falling: the power; 3 is Sobolev smoothness 2 over a plane, 1 a random walk along a line.
         ends: whether the peak-to-peak value is reported, too.
         slow: it drifts: what swings, in the mean, more often over the scan than ``SLOW`` splines can is
@@ -36,6 +37,7 @@ class SmoothEffect(Effect):
     """
 
     coefficients: ClassVar[str]
+    components: ClassVar[int] = 1
     falling: ClassVar[float] = 3.0
     ends: ClassVar[bool] = False
     slow: ClassVar[bool] = False
@@ -45,7 +47,8 @@ class SmoothEffect(Effect):
         super().__init__(scan)
         functions, share = self.basis(scan)
         self.register_buffer("functions", functions, persistent=False)
-        self.frequency = share.rsqrt()  # of each, in half periods over the scan
+        # of each coefficient, in half periods over the scan
+        self.frequency = share.rsqrt().repeat_interleave(self.components)
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:
@@ -67,7 +70,7 @@ class SmoothEffect(Effect):
         Returns:
             The one parameter.
         """
-        share = cls.basis(scan)[1]
+        share = cls.basis(scan)[1].repeat_interleave(cls.components)
         prior = falling_prior(share, likely, cls.falling)
         return (
             Parameter(
@@ -76,9 +79,10 @@ class SmoothEffect(Effect):
         )
 
     def field(self, spots: Tensor | None = None) -> Tensor:
-        """``[B]`` f at ``spots`` ``[B]``, or ``[S]`` at all of them."""
+        """``[B]``, or ``[B, J]``, f at ``spots`` ``[B]``, or at all of them."""
         functions = self.functions if spots is None else self.functions[spots]
-        return functions @ self.value(self.coefficients).reshape(-1)
+        field = functions @ self.value(self.coefficients).reshape(functions.shape[1], self.components)
+        return field[:, 0] if self.components == 1 else field
 
     def is_meant(self, step: Tensor) -> bool:
         power = step.cpu().square()
@@ -106,13 +110,15 @@ class SmoothEffect(Effect):
         """
         deviations = np.array(self.declared[self.coefficients].prior)
         field = deviations * rng.standard_normal(len(deviations))
-        size = float((self.functions.double() @ torch.from_numpy(field)).square().mean().sqrt())
+        functions = self.functions.double()
+        drawn = functions @ torch.from_numpy(field).view(functions.shape[1], self.components)
+        size = float(drawn.square().sum(1).mean().sqrt())
         if size == 0:
             raise UserError(
                 f"{self.name} needs more spots: the scan is too small for a smooth function over it"
             )
-        drawn = torch.from_numpy(field * (self.given_size(values, "rms") / size))
-        self.set_given(self.coefficients, drawn, "rms")
+        given = torch.from_numpy(field * (self.given_size(values, "rms") / size))
+        self.set_given(self.coefficients, given, "rms")
 
 
 def falling_prior(share: Tensor, first: float, falling: float) -> tuple[float, ...]:

@@ -82,7 +82,7 @@ def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
         "set_name": set_name,
         "index": index,
         "spec": asdict(truth.spec),
-        "kind": truth.spec.kind,
+        "kind": truth.kind,
         "right": {name: list(said) for name, said in truth.right.items()},
         "alike": {name: list(said) for name, said in truth.alike.items()},
         "axes": list(truth.axes),

@@ -376,6 +376,7 @@ class Hidden:
 
 
 WALL = ("wall_reflectance", "vignetting", "power_drift")
+DELAYS = ("line_delay", "scene_motion")
 # In the order of the light's way.
 EFFECTS: dict[str, Hidden] = {
     "retro_paint": Hidden(retro_paint, (0.03, 0.1, 0.4), ("retroreflection",), own=True, scan="confocal"),
@@ -395,8 +396,8 @@ EFFECTS: dict[str, Hidden] = {
         baseline_skewed, (0.02, 0.06, 0.15), ("laser_sensor_baseline",), own=True, scan="confocal"
     ),
     "time_offset": Hidden(time_offset, (0.5, 1.5, 5.0), ("time_offset",)),
-    "time_warm_up": Hidden(time_warm_up, (0.5, 1.2, 3.0), ("time_drift",), ("line_delay",)),
-    "time_walk": Hidden(time_walk, (0.5, 1.2, 3.0), ("time_drift",), ("line_delay",)),
+    "time_warm_up": Hidden(time_warm_up, (0.5, 1.2, 3.0), ("time_drift",), DELAYS),
+    "time_walk": Hidden(time_walk, (0.5, 1.2, 3.0), ("time_drift",), DELAYS),
     "jitter_heavy": Hidden(jitter_heavy, (0.2, 0.5, 1.3), ("timing_jitter",)),
     "clock_scale": Hidden(clock_scale, (0.006, 0.02, 0.06), ("clock_scale",)),
     "tail_two_exponentials": Hidden(

@@ -15,7 +15,6 @@ import numpy as np
 from blind_scenes import scan_order, write_scan
 from wild_scenes import WildScene, load
 from wild_table import ALL, STRENGTHS, Spec, spec_of
-from wild_unknown import UNKNOWN
 from wild_work import WildWork
 
 
@@ -54,6 +53,11 @@ class Truth:
     response: tuple[float, float]
     dark: float
 
+    @property
+    def kind(self) -> str:
+        """As `Spec.kind`, but what has come to be known since it was drawn as something unknown is single."""
+        return "unknown" if self.unknown else ("null", "single", "pair")[len(self.names)]
+
 
 def make(set_name: str, index: int, path: str | Path | None = None) -> Truth:
     """The capture number ``index`` of a set, written to ``path`` (replaced if it exists) where given."""
@@ -77,7 +81,7 @@ def hide(spec: Spec) -> Truth:
     others = {name: _measured(spec, tuple(n for n in names if n != name))[0] for name in names}
     rng = np.random.default_rng([spec.seed, 1])
     counts = rng.poisson(expected) if whole.sampler is None else whole.sampler(rng)
-    unknown = next((name for name in names if name in UNKNOWN), "")
+    unknown = next((name for name in names if not ALL[name].right), "")
     return Truth(
         spec=spec,
         scene=whole.scene,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 
@@ -14,6 +15,7 @@ from effect_hand import ONE, SPOT, effect, hand_paths, hand_scan
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Asked
 from nlos_lit.effects.extension import Extension
+from nlos_lit.effects.scene_motion import SceneMotion
 from nlos_lit.functional.surfel_paths import Walls
 
 
@@ -171,6 +173,42 @@ def test_a_moved_wall_is_the_model_of_the_moved_points(kind, name, values):
     expected = model.expected(spots, Extension([moved]))
     assert expected.numpy() == pytest.approx(other.expected(spots).numpy(), rel=1e-4, abs=1e-4)
     assert float((expected - model.expected(spots)).abs().max()) > 0.02 * float(expected.max())
+
+
+def drawn_motion(kind: str, rms: float) -> SceneMotion:
+    motion = effect("scene_motion", kind)
+    motion.draw({"rms": rms}, np.random.default_rng(3))
+    return motion
+
+
+@pytest.mark.parametrize("kind", ["confocal", "single", "exhaustive"])
+def test_a_scene_that_moves_is_at_each_spot_the_scene_that_lies_elsewhere(kind):
+    model, _ = scene(kind)
+    motion, spots = drawn_motion(kind, 0.03), torch.arange(SPOTS)
+    expected, along = model.expected(spots, Extension([motion])), motion.field().detach()
+    for k in spots[::3].tolist():
+        elsewhere = copy.deepcopy(model)
+        elsewhere.anchor += along[k]
+        assert expected[k].numpy() == pytest.approx(
+            elsewhere.expected(spots[k : k + 1])[0].numpy(), rel=1e-4, abs=1e-4
+        )
+    assert float((expected - model.expected(spots)).abs().max()) > 0.02 * float(expected.max())
+
+
+def test_quantities_of_a_motion_are_those_of_its_ways():
+    motion = drawn_motion("confocal", 0.03)
+    way, said = motion.field().detach(), motion.quantities()
+    assert way.shape == (SPOTS, 3)
+    assert way.mean(0).numpy() == pytest.approx(np.zeros(3), abs=1e-7)
+    assert said["rms"].value.item() == pytest.approx(0.03, rel=1e-4)
+    assert way.square().sum(1).mean().sqrt().item() == pytest.approx(0.03, rel=1e-4)
+    for axis, values in zip("xyz", way.T, strict=True):
+        assert said[f"range_{axis}"].value.item() == pytest.approx((values.max() - values.min()).item())
+    # The first three numbers are the smoothest function's: along x, y and z.
+    motion.set("motion", torch.tensor([0.0, 0.01, 0.0] + [0.0] * (motion.declared["motion"].size - 3)))
+    assert motion.field().detach().numpy() == pytest.approx(
+        0.01 * motion.functions[:, :1].numpy() * np.array([0, 1, 0])
+    )
 
 
 def test_offsets_of_time():

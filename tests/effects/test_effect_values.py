@@ -609,7 +609,7 @@ def test_priors_count_nats():
     assert float(effect("irf_tail").precision().sum()) == 0
 
 
-@pytest.mark.parametrize("name", ["power_drift", "time_drift"])
+@pytest.mark.parametrize("name", ["power_drift", "time_drift", "scene_motion"])
 def test_what_swings_in_the_mean_more_than_twelve_times_is_no_drift(name):
     drift = effect(name, scan=grid_scan(24))
     n = drift.amplitudes[0].size
@@ -618,14 +618,14 @@ def test_what_swings_in_the_mean_more_than_twelve_times_is_no_drift(name):
         """Functions with so many half periods (``_24``) over the scan, and so much power."""
         values = torch.zeros(n)
         for half_periods, power in powers.items():
-            values[int(half_periods[1:]) - 1] = power**0.5
+            values[drift.components * (int(half_periods[1:]) - 1)] = power**0.5
         return values
 
     assert drift.is_meant(torch.zeros(n))
     assert drift.is_meant(step(_23=1.0))
     assert not drift.is_meant(step(_26=1.0))
-    assert drift.is_meant(step(_2=0.8, _100=0.2))
-    assert not drift.is_meant(step(_2=0.7, _100=0.3))
+    assert drift.is_meant(step(_2=0.7, _70=0.3))
+    assert not drift.is_meant(step(_2=0.6, _70=0.4))
     assert effect("ambient_drift", scan=grid_scan(24)).is_meant(torch.ones(1))
 
 

@@ -27,6 +27,7 @@ KNOWN = {
     "wall_tilt": TIME,
     "wall_scale": TIME,
     "laser_sensor_baseline": TIME,
+    "scene_motion": TIME,
     "time_drift": TIME,
     "line_delay": TIME,
     "timing_jitter": TIME,
@@ -76,8 +77,8 @@ def test_stage_and_need_of_paths_follow_from_the_hooks():
     moving = {name for name in KNOWN if EFFECTS.named(name)(Scan.of(capture("single"))).moves_light}
     assert moving == {
         *("retroreflection", "specular_lobe", "occlusion", "wall_tilt", "wall_scale"),
-        *("laser_sensor_baseline", "time_drift", "timing_jitter", "time_offset", "clock_scale"),
-        *("line_delay", "power_drift", "wall_reflectance", "vignetting"),
+        *("laser_sensor_baseline", "scene_motion", "time_drift", "timing_jitter", "time_offset"),
+        *("clock_scale", "line_delay", "power_drift", "wall_reflectance", "vignetting"),
     }
 
 

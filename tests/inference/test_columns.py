@@ -43,7 +43,7 @@ from nlos_lit.surfels.model import SurfelModel, inverse_softplus
 pytestmark = FORWARD_MODE
 # Step of differences. A slope of 8e-6 among counts of 8 is lost in their rounding where steps are finer.
 STEP = 3e-4
-DELAYS = ("free_scan_delay", "free_wall_delay", "time_drift", "line_delay")
+DELAYS = ("free_scan_delay", "free_wall_delay", "time_drift", "line_delay", "scene_motion")
 ACCEPTED = {
     "none": {},
     "gain and pile-up": {"vignetting": {"strength": 0.3}, "pile_up": {"detections": 0.5}},
@@ -252,10 +252,11 @@ def test_shapes_side_by_side_are_those_one_by_one(effect, elements, monkeypatch)
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda e: e.name)
-def test_only_delays_have_factors(effect):
+def test_only_delays_and_motions_have_factors(effect):
     """Of the registry: what turns the wall delays no spot as a whole."""
     _, _, scan, spots = setting("single")
-    assert (effect(scan).factors(spots) is not None) is (effect.name in ("time_drift", "line_delay"))
+    known = ("scene_motion", "time_drift", "line_delay")
+    assert (effect(scan).factors(spots) is not None) is (effect.name in known)
 
 
 @pytest.mark.parametrize(("most", "groups"), [(1, 1), (2, 2), (5, 4), (16, 16), (55, 32), (56, 56), (99, 56)])
