@@ -43,8 +43,8 @@ class Effect(nn.Module, Hooks):
             ``offset``), or nothing.
         per_spot: its parameter is one random number a spot, drawn from a normal distribution whose width is
             what is reported.
-        octave: which of its coefficients have a prior width in common, that the counts are asked for, ``[k]``
-            numbers from 0 on; None where all have.
+        width_of: ``[k]`` numbers, from 0 on, of the prior widths that its coefficients have, which the counts
+            are asked for; None where all have the same.
         in_runs: of such an effect, neighbouring spots may share their numbers. Otherwise only what a spot has
             over its neighbours counts.
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
@@ -73,7 +73,7 @@ class Effect(nn.Module, Hooks):
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False
-    octave: Tensor | None = None
+    width_of: Tensor | None = None
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()

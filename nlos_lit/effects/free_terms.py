@@ -21,7 +21,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
 from nlos_lit.effects.scan_pieces import bands, stretches
-from nlos_lit.effects.smooth import falling_prior, fast, length, over_scan, over_wall
+from nlos_lit.effects.smooth import SeveralWidths, falling_prior, fast, length, over_scan, over_wall
 from nlos_lit.effects.timing_jitter import TimingJitter
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.delays import filtered
@@ -108,28 +108,19 @@ class FreeTerm(Free):
         return {"rms": Quantity(length(field / field.numel() ** 0.5, p.scale), p.unit, kind=p.kind)}
 
 
-class AlongScan(FreeTerm):
+class AlongScan(SeveralWidths, FreeTerm):
     """Splines over the scan; each octave of frequencies is as likely, and may then have a width of its own.
 
     Fitted spots leave gaps, of a line or so. What swings must be followed through them, and what does not
     must not swing there.
-
-    Attributes:
-        relative: ``[K]`` prior deviations that the counts ask for, over those that were likely beforehand.
     """
 
     axis = "scan"
-    octave: Tensor
-    relative: Tensor
 
     def __init__(self, scan: Scan) -> None:
         super().__init__(scan)
         share = over_scan(scan, self.splines(scan))[1]
-        self.octave = (-0.5 * share.log2()).floor().long()
-        self.register_buffer("relative", torch.ones(len(share)))
-
-    def _precision(self, p: Parameter) -> Tensor:
-        return super()._precision(p) / self.relative.cpu().square()
+        self.give_widths((-0.5 * share.log2()).floor().long())
 
     @classmethod
     def splines(cls, scan: Scan) -> int:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import torch
 from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.parameter import Parameter, Quantity
-from nlos_lit.effects.smooth import SmoothEffect, fast, over_scan
+from nlos_lit.effects.smooth import SeveralWidths, SmoothEffect, fast, over_scan
 from nlos_lit.effects.words import EffectWords
 from nlos_lit.functional.surfel_paths import Walls
 
@@ -17,12 +18,13 @@ AXES = ("x", "y", "z")
 SPLINES = 80  # over the scan at most: each has three coefficients
 
 
-class SceneMotion(SmoothEffect):
+class SceneMotion(SeveralWidths, SmoothEffect):
     """The whole scene moves against the wall, without turning.
 
     ``p → p + d(u)`` for the scene's points, u the order of acquisition from -1 to 1, d along x, y and z a
     cubic spline each without its constant, of 80 functions (of one for every four spots where they are few),
-    likely a random walk. Paths are exact: the wall's points move the other way instead.
+    likely a random walk, along each axis as wide as the counts ask for. Paths are exact: the wall's points
+    move the other way instead.
 
     Parameters: ``motion`` (m), at most 79 coefficients along each axis, null 0. Quantities ``rms`` of d's
     length, and ``range_x``, ``range_y`` and ``range_z`` from one end to the other (m).
@@ -52,6 +54,10 @@ class SceneMotion(SmoothEffect):
     components = len(AXES)
     falling: ClassVar[float] = 1.0
     slow: ClassVar[bool] = True
+
+    def __init__(self, scan: Scan) -> None:
+        super().__init__(scan)
+        self.give_widths(torch.arange(len(AXES)).repeat(self.functions.shape[1]))
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

@@ -121,6 +121,30 @@ class SmoothEffect(Effect):
         self.set_given(self.coefficients, given, "rms")
 
 
+class SeveralWidths(Effect):
+    """One parameter, coefficients whose prior may have several widths: the counts are asked for each.
+
+    Attributes:
+        width_of: ``[k]`` number of each coefficient's width.
+        relative: ``[k]`` prior deviations that the counts ask for, over those that were likely beforehand.
+    """
+
+    width_of: Tensor
+    relative: Tensor
+
+    def give_widths(self, width_of: Tensor) -> None:
+        """Say which coefficients have a width in common.
+
+        Args:
+            width_of: ``[k]`` numbers from 0 on.
+        """
+        self.width_of = width_of
+        self.register_buffer("relative", torch.ones(len(width_of)))
+
+    def _precision(self, p: Parameter) -> Tensor:
+        return super()._precision(p) / self.relative.cpu().square()
+
+
 def falling_prior(share: Tensor, first: float, falling: float) -> tuple[float, ...]:
     """Prior deviations of coefficients that fall with a power of the frequency.
 

@@ -46,7 +46,7 @@ from nlos_lit.inference.problem import Problem
 
 SEGMENTS = 4  # parts of a wall block along time
 VARIANCES = np.exp(np.linspace(-14.0, 8.0, 45))  # τ² that are tried, of C
-ROUNDS, LEAST = 30, 0.01  # of widths by octave that are improved, and the least over τ
+ROUNDS, LEAST = 30, 0.01  # of several widths that are improved, and the least over τ
 UNEVENNESS = np.exp(np.linspace(math.log(2e-3), math.log(0.5), 24))  # u that are tried
 
 
@@ -259,7 +259,7 @@ def evidence(
     block: Tensor,
     deviation: Tensor,
     bounds: tuple[Tensor, Tensor] | None = None,
-    octave: Tensor | None = None,
+    width_of: Tensor | None = None,
 ) -> Evidence:
     """The log Bayes factor of a term, the base projected off.
 
@@ -270,7 +270,7 @@ def evidence(
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
-        octave: ``[k]`` which of them have a width in common; None where all have.
+        width_of: ``[k]`` which of them have a width in common; None where all have.
 
     Returns:
         what the counts say of it.
@@ -305,9 +305,9 @@ def evidence(
     share = u.square() / values
     nats, variance, mean = best(scatter, bounds)
     mean_scatter, relative = float((scatter * share).sum() / share.sum().clamp_min(1e-30)), None
-    if octave is not None and nats > 0:
+    if width_of is not None and nats > 0:
         score, information = s.sum(0) / mean_scatter, f.sum(0) / mean_scatter
-        mean, relative = by_octave(score, information, octave, variance)
+        mean, relative = by_width(score, information, width_of, variance)
         mean = within(mean, bounds)
     whole = raw.square().sum(1).double().sum(0) * deviation**2
     does = whole > 1e-12 * whole.max()  # coefficients that change anything at this shape
@@ -323,13 +323,13 @@ def evidence(
     )
 
 
-def by_octave(score: Tensor, information: Tensor, octave: Tensor, variance: float) -> tuple[Tensor, Tensor]:
+def by_width(score: Tensor, information: Tensor, width_of: Tensor, variance: float) -> tuple[Tensor, Tensor]:
     """Coefficients whose groups have widths of their own, where the likelihood is largest.
 
     Args:
         score: ``[k]`` of coefficients that are all as likely beforehand.
         information: ``[k, k]`` of them.
-        octave: ``[k]`` number of each one's group.
+        width_of: ``[k]`` number of each one's group.
         variance: τ², where all have one.
 
     Returns:
@@ -338,7 +338,7 @@ def by_octave(score: Tensor, information: Tensor, octave: Tensor, variance: floa
     Examples:
         Two that are 3 ± 0.1 and two that are nothing:
 
-        >>> mean, relative = by_octave(
+        >>> mean, relative = by_width(
         ...     torch.tensor([300.0, -300.0, 5.0, 5.0]).double(),
         ...     100 * torch.eye(4).double(),
         ...     torch.tensor([0, 0, 1, 1]),
@@ -347,16 +347,16 @@ def by_octave(score: Tensor, information: Tensor, octave: Tensor, variance: floa
         >>> mean.round(decimals=2).tolist(), relative.round(decimals=2).tolist()
         ([3.0, -3.0, 0.0, 0.0], [1.5, 1.5, 0.01, 0.01])
     """
-    widths = score.new_full((int(octave.max()) + 1,), variance)
+    widths = score.new_full((int(width_of.max()) + 1,), variance)
     for _ in range(ROUNDS):
-        prior = widths[octave]
+        prior = widths[width_of]
         covariance = torch.linalg.inv(information + torch.diag(prior.reciprocal()))
         mean = covariance @ score
         told = 1 - covariance.diagonal() / prior  # how much of each the counts settle
-        squares = torch.zeros_like(widths).index_add_(0, octave, mean.square())
-        number = torch.zeros_like(widths).index_add_(0, octave, told)
+        squares = torch.zeros_like(widths).index_add_(0, width_of, mean.square())
+        number = torch.zeros_like(widths).index_add_(0, width_of, told)
         widths = (squares / number.clamp_min(1e-12)).clamp_min(LEAST**2 * variance)
-    return mean, (widths[octave] / variance).sqrt()
+    return mean, (widths[width_of] / variance).sqrt()
 
 
 def best_evidence(
@@ -366,7 +366,7 @@ def best_evidence(
     block: Tensor,
     deviation: Tensor,
     bounds: tuple[Tensor, Tensor] | None = None,
-    octave: Tensor | None = None,
+    width_of: Tensor | None = None,
 ) -> Evidence:
     """The log Bayes factor of a term, the scene as uneven as the counts ask for without it, or with it.
 
@@ -377,7 +377,7 @@ def best_evidence(
         block: ``[S]`` number of each spot's wall block.
         deviation: ``[k]`` C^½.
         bounds: ``[k]`` least and largest coefficients.
-        octave: ``[k]`` which of them have a width in common; None where all have.
+        width_of: ``[k]`` which of them have a width in common; None where all have.
 
     Returns:
         what the counts say of it, at the width where they say most.
@@ -386,7 +386,7 @@ def best_evidence(
     for width in sorted({projector.width, projector.width_beside(z, across, deviation)}):
         off = known if width == projector.width else projector.even(z, width, across)
         level = float(projector.levels[width])
-        one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds, octave)
+        one = evidence(raw, off, projector.residual_at(width), block, deviation, bounds, width_of)
         found.append((replace(one, nats=one.nats + level, loud=max(0.0, one.loud + level)), off))
     best, off = max(found, key=lambda pair: pair[0].nats)
     return replace(best, lit=lit_share(off[: len(projector.lit)] * deviation.float(), projector.lit))

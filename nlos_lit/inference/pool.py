@@ -17,8 +17,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, FREE_NAMES, AlongScan
+from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.effects.parameter import Parameter
+from nlos_lit.effects.smooth import SeveralWidths
 from nlos_lit.inference.evidence import (
     SEGMENTS,
     Evidence,
@@ -572,7 +573,7 @@ def _evidence(
     problem: Problem, projector: Projector, effect: Effect, columns: Tensor, freed: Freed, block: Tensor
 ) -> Evidence:
     raw = columns.reshape(*problem.expected.shape, -1)
-    prior = prior_deviations(effect), effect.step_bounds(), effect.octave
+    prior = prior_deviations(effect), effect.step_bounds(), effect.width_of
     found = best_evidence(projector, raw, freed, block, *prior)
     return found if effect.is_meant(found.step) else replace(found, nats=0.0, loud=0.0)
 
@@ -590,7 +591,7 @@ def _with_scale(effect: Effect, found: Evidence) -> Effect:
     """The effect, its prior as wide as the counts ask for."""
     if bool(effect.precision().any()) and found.scale:
         effect.prior_scale = found.scale
-    if isinstance(effect, AlongScan) and found.relative is not None:
+    if isinstance(effect, SeveralWidths) and found.relative is not None:
         effect.relative.copy_(found.relative)
     return effect
 

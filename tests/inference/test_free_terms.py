@@ -16,7 +16,7 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, tails_of, time_bands
 from nlos_lit.effects.scan_pieces import bands
 from nlos_lit.inference import pool
-from nlos_lit.inference.evidence import by_octave, prior_deviations
+from nlos_lit.inference.evidence import by_width, prior_deviations
 from nlos_lit.inference.pool import Candidate, screen
 from nlos_lit.inference.problem import build_problem
 
@@ -279,20 +279,20 @@ def test_what_swings_is_followed_through_gaps(half_periods):
     score = functions[seen].T @ (wave + noise)[seen] / 0.03**2
     information = functions[seen].T @ functions[seen] / 0.03**2
     errors = []
-    for octave in (torch.zeros_like(term.octave), term.octave):
-        mean, relative = by_octave(score, information, octave, 1.0)
+    for octave in (torch.zeros_like(term.width_of), term.width_of):
+        mean, relative = by_width(score, information, octave, 1.0)
         errors.append(float((functions @ mean - wave)[~seen].square().mean().sqrt()))
     assert errors[1] < (0.5 if half_periods == 60 else 1.0) * errors[0]
     assert errors[1] < 0.03
-    right = term.octave == int(np.log2(half_periods))
+    right = term.width_of == int(np.log2(half_periods))
     assert relative[right].min() > relative[~right].max()
 
 
-def test_a_width_by_octave_is_the_priors():
+def test_a_width_by_width_is_the_priors():
     """Twice as wide: a quarter of the penalty."""
     term = with_one("free_scan", 40, 0.1)
     before = float(term.penalty().detach())
-    term.relative[term.octave == term.octave[40]] = 2.0
+    term.relative[term.width_of == term.width_of[40]] = 2.0
     assert float(term.penalty().detach()) == pytest.approx(before / 4)
     assert prior_deviations(term).tolist() == pytest.approx(
         prior_deviations(effect_of("free_scan", SCAN)).tolist()
@@ -303,7 +303,7 @@ def test_a_width_by_octave_is_the_priors():
 def test_a_ripple_is_begun_with_a_width_of_its_own():
     ripple = with_one("free_scan", 39, 0.1)
     found = {c.name: c for c in planted(ripple, seed=2)}
-    relative, octave = found["free_scan"].effect.relative, ripple.octave
+    relative, octave = found["free_scan"].effect.relative, ripple.width_of
     assert relative[octave == octave[39]].min() > 3 * relative[octave != octave[39]].max()
 
 

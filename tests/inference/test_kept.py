@@ -20,7 +20,8 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
-from nlos_lit.effects.free_terms import FREE, AlongScan
+from nlos_lit.effects.free_terms import FREE
+from nlos_lit.effects.smooth import SeveralWidths
 from nlos_lit.inference.criticise import begun_with
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.pool import Pool, Taken, screen
@@ -41,7 +42,7 @@ def test_effects_come_back(kind, tmp_path):
     scan = Scan.of(capture_of(raster(6)))
     effect = uneven(kind(scan))
     effect.width, effect.share, effect.prior_scale = 0.3, 0.7, 0.25
-    if isinstance(effect, AlongScan):
+    if isinstance(effect, SeveralWidths):
         effect.relative.uniform_(0.1, 2.0)
     for trained in (True, False):
         again = kept(effect.requires_grad_(trained), scan, tmp_path)
