@@ -180,9 +180,9 @@ RIVALS += (
 )  # those whose columns are soon worked out
 
 
-def planted(effect: Effect, seed: int) -> list[Candidate]:
+def planted(effect: Effect, seed: int, *rivals: str) -> list[Candidate]:
     """What free terms and some of the registry are worth about counts that are drawn with an effect."""
-    names = {*FREE_NAMES, *RIVALS, effect.name}
+    names = {*FREE_NAMES, *RIVALS, effect.name, *rivals}
     model = surfels(SCENE, level=4.0)
     measured = drawn(model, Extension([effect]), SCENE, seed)
     problem = build_problem(model, Extension([]), SPOTS, torch.from_numpy(measured.gated_counts()))
@@ -288,7 +288,7 @@ def test_what_swings_is_followed_through_gaps(half_periods):
     assert relative[right].min() > relative[~right].max()
 
 
-def test_a_width_by_width_is_the_priors():
+def test_a_width_of_some_coefficients_is_the_priors():
     """Twice as wide: a quarter of the penalty."""
     term = with_one("free_scan", 40, 0.1)
     before = float(term.penalty().detach())
@@ -305,6 +305,32 @@ def test_a_ripple_is_begun_with_a_width_of_its_own():
     found = {c.name: c for c in planted(ripple, seed=2)}
     relative, octave = found["free_scan"].effect.relative, ripple.width_of
     assert relative[octave == octave[39]].min() > 3 * relative[octave != octave[39]].max()
+
+
+@FORWARD_MODE
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_scene_that_moves_is_told_from_a_time_zero_that_drifts(axis):
+    """Along x, y or z, by a function that swings six times; along the others it is asked for less widely."""
+    motion = effect_of("scene_motion", SCAN)
+    values = torch.zeros(motion.declared["motion"].size)
+    values[3 * 11 + axis] = 0.3 * BIN
+    motion.set("motion", values)
+    found = {c.name: c for c in planted(motion, seed=2)}
+    drift, moved = found["time_drift"], found["scene_motion"]
+    assert moved.evidence > drift.evidence + 8, (moved.evidence, drift.evidence)
+    relative = moved.effect.relative.view(-1, 3)[0]
+    assert relative[axis] > relative.sum() - relative[axis]
+    assert moved.step.view(-1, 3)[11, axis].item() == pytest.approx(0.6, rel=0.3)
+
+
+@FORWARD_MODE
+def test_a_time_zero_that_drifts_is_told_from_a_scene_that_moves():
+    drift = effect_of("time_drift", SCAN)
+    values = torch.zeros(drift.declared["drift"].size)
+    values[11] = 0.1 * BIN
+    drift.set("drift", values)
+    found = {c.name: c.evidence for c in planted(drift, 2, "scene_motion")}
+    assert found["time_drift"] > found["scene_motion"] > 20, found
 
 
 def test_rows_are_a_fixed_choice_of_the_fitted_ones():
