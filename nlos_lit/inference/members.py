@@ -225,7 +225,8 @@ def chosen(trials: list[Trial], odds: float, least: float) -> Trial:
     Args:
         trials: in one place, with weights, the largest gain first; none is not chosen.
         odds: share of the best one's weight from which on a simpler one goes before it, as it does from
-            ``MOST`` of its gain on; but no effect before a free term that predicts better by so much weight …
+            ``MOST`` of its gain and of its evidence on; but no effect before a free term that predicts better
+            by so much weight …
         least: … or that, doing what the effect cannot, is asked for by so many nats more.
 
     Returns:
@@ -240,8 +241,8 @@ def chosen(trials: list[Trial], odds: float, least: float) -> Trial:
         unknown = one.free and not other.free
         if unknown and one.name not in other.effect.followed_by and one.evidence > other.evidence + least:
             return False
-        gains = trial.gain.nats >= MOST * first.gain.nats and not unknown
-        return gains or trial.weight >= odds * first.weight
+        gains = trial.gain.nats >= MOST * first.gain.nats and other.evidence >= MOST * one.evidence
+        return (gains and not unknown) or trial.weight >= odds * first.weight
 
     return min([first, *filter(near, others)], key=cost)
 

@@ -237,9 +237,9 @@ def gained(name: str, nats: float, weight: float = 0.01) -> Trial:
 
 
 def test_the_simplest_of_the_terms_that_gain_most():
-    """Nine tenths of the best gain, or a quarter of its weight, are enough for fewer coefficients; a quarter
-    of its weight for an effect beside a free term, unless that is asked for by 8 nats more and does what the
-    effect cannot.
+    """Nine tenths of the best gain and of its evidence, or a quarter of its weight, are enough for fewer
+    coefficients; a quarter of its weight for an effect beside a free term, unless that is asked for by 8 nats
+    more and does what the effect cannot.
     """
 
     def name(*trials: Trial) -> str:
@@ -249,6 +249,9 @@ def test_the_simplest_of_the_terms_that_gain_most():
     assert len(wide.candidate.step) > len(free.candidate.step) > 1
     assert name(wide, gained("vignetting", 90.1)) == "vignetting"
     assert name(wide, gained("vignetting", 89.9)) == "wall_reflectance"
+    for evidence, said in ((90.1, "vignetting"), (89.9, "wall_reflectance")):
+        less = replace(gained("vignetting", 99.0), candidate=candidate("vignetting", evidence))
+        assert name(wide, less) == said
     assert name(wide, gained("vignetting", 50.0, 0.201)) == "vignetting"
     assert name(wide, gained("vignetting", 50.0, 0.199)) == "wall_reflectance"
     assert name(free, gained("wall_reflectance", 99.0, 0.201)) == "wall_reflectance"
