@@ -7,7 +7,8 @@
     python benchmarks/blind.py sensitivity set=development commit=…     what other constants would have said
 
 Development captures may be looked at as often as one likes, validation captures when a design is finished;
-the test set is drawn and run once, when the rules are frozen (docs/blind.md).
+the test set is drawn and run once, by the commit of the frozen rules (docs/blind.md). What it says is shown
+when all of it is there, and not before.
 """
 
 from __future__ import annotations
@@ -73,7 +74,9 @@ def run(set_name: str, first: int, number: int, processes: int) -> None:
         jobs = [pool.submit(work, set_name, k) for k in todo]
         for count, job in enumerate(as_completed(jobs), 1):
             left = (time.monotonic() - began) / count * (len(jobs) - count)
-            print(f"[{count}/{len(jobs)}, {left / 60:.0f} min left] {line(job.result())}", flush=True)
+            row = job.result()
+            said = f"test {row['index']} is stored" if set_name == "test" else line(row)
+            print(f"[{count}/{len(jobs)}, {left / 60:.0f} min left] {said}", flush=True)
 
 
 def keep_rows(set_name: str) -> None:
@@ -333,6 +336,16 @@ def side_by_side(looks: dict[str, list[dict]]) -> str:
     return "\n".join(out)
 
 
+def test_set(rows: list[dict]) -> str:
+    """What is said of the test set: how much of it has been run, and the rates when that is all."""
+    from wild_table import LENGTH
+
+    head = "## The test set\n\n"
+    if {row["index"] for row in rows} != set(range(LENGTH)):
+        return f"{head}{len(rows)} of {LENGTH} captures have been run. None has been looked at.\n"
+    return f"{head}{rates(rows)}\n\n{captures(rows)}\n"
+
+
 def report() -> None:
     """Rewrite the tables of docs/blind.md."""
     cases = [json.loads(text) for text in ROWS.read_text().splitlines()]
@@ -341,7 +354,7 @@ def report() -> None:
     )
     looks = looks_of(validation)
     newest = {c["index"]: c for c in development}
-    parts = [f"## The test set\n\n{rates(test)}\n\n{captures(test)}\n"] if test else []
+    parts = [test_set(test)]
     parts += [f"## The last look at the validation set\n\n{rates(next(iter(looks.values())))}\n"]
     parts += [f"## All looks at the validation set, the last first\n\n{side_by_side(looks)}\n"]
     parts += [f"## Captures of the validation set\n\n{captures(validation)}\n"]

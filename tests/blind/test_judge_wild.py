@@ -9,7 +9,7 @@ import pytest
 import torch
 from conftest import ROOT
 from judge_wild import reached
-from wild_table import Spec
+from wild_table import LENGTH, Spec
 from wild_truth import hide, write
 
 from data_modules.readers import read_capture
@@ -108,3 +108,12 @@ def test_what_a_true_cause_gains(tmp_path):
     share = reached(truth, capture, SimpleNamespace(untouched_test=told))
     assert share == pytest.approx(1, abs=0.15)
     assert share > 1, "its scene is not the true one"
+
+
+def test_nothing_is_said_of_a_test_set_that_is_not_complete(monkeypatch):
+    rows = [ECHO | {"index": k} for k in range(LENGTH)]
+    monkeypatch.setattr(blind, "rates", lambda cases: f"rates of {len(cases)}")
+    monkeypatch.setattr(blind, "captures", lambda cases: "captures")
+    assert "rates" not in blind.test_set(rows[1:])
+    assert "209 of 210 captures have been run" in blind.test_set(rows[1:])
+    assert "rates of 210" in blind.test_set(rows)
