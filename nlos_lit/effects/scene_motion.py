@@ -33,7 +33,8 @@ class SceneMotion(SeveralWidths, SmoothEffect):
     along the way that it moved. A motion that swings more than 12 times during the scan is none.
 
     Degenerate with: ``time_drift``, from which a motion towards the wall differs only where parts of the
-    scene are seen at other angles; ``line_delay``, where it moves from line to line.
+    scene are seen at other angles; ``line_delay``, where it moves from line to line; a scene that lies
+    turned, where a steady motion goes along with the slow axis of a raster: of that, ranges say too little.
 
     Source: geometry.
     """
@@ -46,10 +47,10 @@ class SceneMotion(SeveralWidths, SmoothEffect):
         remedy="Keep scene and rig still, scan faster, or cut the scan where it moved.",
         headline="{range_z} along z, {range_x} along x, {range_y} along y",
     )
-    split_by: ClassVar = {
-        name: "the direct pulse of each spot: a time zero that drifts moves it, a scene that moves does not"
-        for name in ("time_drift", "line_delay")
-    }
+    split_by: ClassVar = dict.fromkeys(
+        ("time_drift", "line_delay"),
+        "the direct pulse of each spot: a time zero that drifts moves it, a scene that moves does not",
+    )
     coefficients = "motion"
     components = len(AXES)
     falling: ClassVar[float] = 1.0
