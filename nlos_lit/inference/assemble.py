@@ -251,7 +251,6 @@ def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
 def _screened(candidate: Candidate, least: float) -> Screened:
     effect, start = candidate.effect, 0
     step, detectable = {}, {}
-    visible = visible_score(least) + NINE_OF_TEN
     for p in effect.amplitudes:
         part = slice(start, start + p.size)
         error = candidate.error[part][torch.isfinite(candidate.error[part])]
@@ -261,7 +260,7 @@ def _screened(candidate: Candidate, least: float) -> Screened:
                 if p.size > 1
                 else float((p.null or 0.0) + p.scale * candidate.step[part])
             )
-        detectable[p.name] = float(visible * p.scale * error.square().mean().sqrt())
+        detectable[p.name] = p.scale * _visible(error, least, alone=effect.per_spot)
         start += p.size
     return Screened(
         name=effect.name,
@@ -273,6 +272,18 @@ def _screened(candidate: Candidate, least: float) -> Screened:
         shape=candidate.shape,
         detectable=detectable,
     )
+
+
+def _visible(error: Tensor, least: float, alone: bool) -> float:
+    """How large k coefficients must be, all alike, to have so much evidence in nine of ten captures.
+
+    ``error`` ``[k]`` is that of each: together they have the sum of what each has. Numbers of single spots
+    stand ``alone``. Not a number where no error is known.
+    """
+    k = len(error)
+    if alone or not k:
+        return float((visible_score(least) + NINE_OF_TEN) * error.square().mean().sqrt())
+    return float((visible_score(least / k) + NINE_OF_TEN / k**0.5) * error.pow(-2).mean().rsqrt())
 
 
 def visible_score(least: float) -> float:

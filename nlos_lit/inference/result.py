@@ -149,7 +149,7 @@ class Screened:
         degrees: coefficients.
         one_step: estimated parameters. shape: scanned ones.
         detectable: the smallest amplitude of each parameter that this capture would reveal in nine of ten
-            cases.
+            cases; of many coefficients, if all are as large.
     """
 
     name: str
