@@ -250,6 +250,7 @@ def _gain(fit: SurfelFit, loss: Comparison, split: Split) -> Gain:
 
 def _screened(candidate: Candidate, least: float) -> Screened:
     effect, start = candidate.effect, 0
+    least += math.log(len(effect.shape_grid()))  # that one of its shapes alone is asked for
     step, detectable = {}, {}
     for p in effect.amplitudes:
         part = slice(start, start + p.size)

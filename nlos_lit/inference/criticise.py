@@ -72,7 +72,8 @@ class CriticismSettings:
         most: terms that are tried together at most.
         rivals: look-alikes that are tried in the place of each term that holds, at most.
         open_share: weight above which the capture leaves open that a rival is meant.
-        odds: share of the best one's weight from which on a simpler rival goes before it.
+        odds: share of the best one's weight from which on a simpler rival goes before it, and effects before
+            something unknown by itself.
         toys: simulated captures for the null distribution.
         processes: that work on them; fits that go on side by side.
     """
@@ -554,6 +555,28 @@ class Loop:
         coarse = self.built_with(effects.coarse, [m.name for m in staying])
         return Held(staying, self.grown(coarse, "with_those_that_do_more"), coarse)
 
+    def unsaid(self, pool: Pool, held: Held) -> Candidate | None:
+        """What an unknown by itself would have to be, to be held against the effects that hold.
+
+        Effects that look alike may do together what none of them does alone. So what holds is held against a
+        scene that never had any of it, and was built with the free term that may be asked for most.
+
+        Args:
+            pool: what the counts ask for beside the parsimonious scene without any term.
+            held: what holds.
+
+        Returns:
+            Of the free terms that do what no effect that holds can, the one with most evidence where its
+            scatter is its own; None where no effect holds, one of them has a number for each spot, of which
+            others know nothing, or no free term is asked for.
+        """
+        effects = [m for m in held.members if m.accepted and not m.candidate.free]
+        if not effects or any(m.candidate.effect.per_spot for m in effects):
+            return None
+        does = {m.name for m in held.members}.union(*(m.candidate.effect.followed_by for m in effects))
+        free = [c for c in pool.candidates if c.free and not c.effect.per_spot and c.name not in does]
+        return max((c for c in free if c.evidence > self.least), key=lambda c: c.loud, default=None)
+
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""
         names = [m.name for m in gone]
@@ -967,24 +990,50 @@ def criticise(
             pool = asked(effects=False)
         return with_those(joined_by([], free=True), beside)
 
-    if (leads := pool.foreign) is not None:
-        before, found.members = pool, [Member(leads)]
-        coarse = loop.joined(base, [leads])
+    def led_by(leads: Candidate, before: Pool) -> Held:
+        """What holds where a free term goes before all effects, beside the scene that was built with it."""
+        nonlocal pool
+        found.members = [Member(leads)]
         told(first, coarse, found.members)
         pool = asked(effects=True)
         rivals = [c for c in lost(before.candidates, pool.candidates, loop.least) if c.free]
-        held = with_those([Member(leads, rivals)], held)
+        return with_those([Member(leads, rivals)], Held([], first, base))
+
+    def beside(start: Held, new: list[Member]) -> Held:
+        """What holds when effects and free terms have come to what holds, and ``new`` have already."""
+        effects = with_those(joined_by(new, free=False), start)
+        fewer: Held | None = start  # what they do may be what something unknown does
+        held = effects
+        if len(effects.members) <= len(start.members) or loop.predicts(effects.scene, start.scene):
+            held = with_free(effects)
+            fewer = loop.but_outdone(effects, start, found.members)
+        if fewer is None:
+            return held
+        known = found.members
+        other = with_free(fewer)
+        if len(other.members) <= len(fewer.members):
+            found.members = known
+            return held
+        less = {m.name for m in effects.members} - {m.name for m in fewer.members}
+        gone = [replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members]
+        found.members = gone
+        return other
+
+    first_pool = pool
+    if (leads := pool.foreign) is not None:
+        coarse = loop.joined(base, [leads])
+        held = led_by(leads, pool)
         if not held.members:
-            held, coarse, pool, found.members = begun, base, before, []
+            held, coarse, pool, found.members = begun, base, first_pool, []
     start, new = held, list[Member]()
     if not start.members:
         begun = loop.begun(base, first, pool)
         coarse, new = begun.coarse, begun.members
         if coarse is not base and not new:
-            start, first = begun, begun.scene
+            start, first, base = begun, begun.scene, coarse
             found = Findings(first, first, loop.needed(first))
             told(first, first, [])
-            pool = asked(effects=True)
+            first_pool = pool = asked(effects=True)
     if new:
         before, pool = pool, asked(effects=True)
         rivals = lost(before.candidates, pool.candidates, loop.least)
@@ -992,22 +1041,16 @@ def criticise(
         new = [replace(m, rivals=each_once(*m.rivals, *ahead_of(m.candidate, rivals), *alike)) for m in new]
         found.members = found.members + new
         told(first, coarse, found.members)
-    effects = with_those(joined_by(new, free=False), start)
-    fewer: Held | None = start  # what they do may be what something unknown does
-    if len(effects.members) > len(start.members) and not loop.predicts(effects.scene, start.scene):
-        held = effects
-    else:
-        held = with_free(effects)
-        fewer = loop.but_outdone(effects, start, found.members)
-    if fewer is not None:
-        known = found.members
-        other = with_free(fewer)
-        if len(other.members) > len(fewer.members):
-            less = {m.name for m in effects.members} - {m.name for m in fewer.members}
-            gone = [replace(m, accepted=False, gone=True) if m.name in less else m for m in found.members]
-            held, found.members = other, gone
-        else:
-            found.members = known
+    held = beside(start, new)
+    instead = None if start.members else loop.unsaid(first_pool, held)
+    if instead is not None:
+        known, coarse = found.members, loop.joined(base, [instead])
+        if loop.predicts(coarse, held.coarse, 1 / (1 + s.odds)):
+            other = led_by(instead, first_pool)
+            if other.members:
+                held = beside(other, [])
+            else:
+                found.members = known
     found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
         found.final = scene

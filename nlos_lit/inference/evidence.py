@@ -226,7 +226,7 @@ class Evidence:
         nats: log Bayes factor against no such term; at least 0, which τ = 0 gives.
         scale: τ.
         step: ``[k]`` posterior mean of the stored amplitudes' change.
-        error: ``[k]`` its standard deviation by counts alone.
+        error: ``[k]`` standard deviation of each by counts alone, where the others stay as they are.
         retained: share of the term's information that the base cannot imitate.
         scatter: φ, mean over the directions weighted by their scores.
         loud: nats if all of the scatter were the term's own.
@@ -315,7 +315,7 @@ def evidence(
         nats=nats,
         scale=variance**0.5,
         step=(mean * deviation).float(),
-        error=((vectors.square() @ (scatter / values)).sqrt() * deviation).float(),
+        error=((vectors.square() @ (values / scatter)).rsqrt() * deviation).float(),
         retained=float((f.sum(0).diagonal() / whole)[does].mean()) if bool(does.any()) else 0.0,
         scatter=mean_scatter,
         loud=loud,

@@ -62,7 +62,8 @@ class Candidate:
         retained: share of its information that the base cannot imitate.
         scatter: how much more its scores scatter between wall blocks than counts do.
         shape: scanned parameters.
-        step: ``[k]`` change of the stored amplitudes that the counts ask for. error: of it.
+        step: ``[k]`` change of the stored amplitudes that the counts ask for. error: of each,
+            where the others stay as they are.
         loud: nats if all of the scatter were the term's own, as it is of a strong one: one linear step leaves
             an error that scatters like a misfit.
         lit: how far a misfit of the scene may look like it: the share of its information that lies where the

@@ -478,7 +478,8 @@ def test_screened_in_units_of_the_parameters():
         Candidate(tail, 30.0, 0.4, 1.0, {"decay": 0.11}, torch.tensor([2.0]), torch.tensor([0.3]), 30.0), 8.3
     )
     assert found.one_step["fraction"] == pytest.approx(0.1)
-    assert found.detectable["fraction"] == pytest.approx((visible_score(8.3) + 1.2816) * 0.05 * 0.3)
+    visible = visible_score(8.3 + math.log(len(tail.shape_grid()))) + 1.2816
+    assert found.detectable["fraction"] == pytest.approx(visible * 0.05 * 0.3)
     assert (found.degrees, found.shape, found.evidence) == (1, {"decay": 0.11}, 30)
     retro = effect_of("retroreflection", SCAN)
     step = torch.tensor([-1.0, 0.5, 2.0])

@@ -641,6 +641,52 @@ def test_which_free_term_goes_before_all_effects(evidence, effect, first):
     assert foreign([candidate("free_spot_gain", 400.0), *others], LEAST) is None
 
 
+@pytest.mark.parametrize(
+    ("effect", "free", "alone", "named"),
+    [
+        ("ambient_map", "free_rate", 22.0, "free_rate"),
+        ("ambient_map", "free_rate", 18.0, "ambient_map"),
+        ("pile_up", "free_rate", 22.0, "pile_up"),
+        ("hot_spots", "free_rate", 22.0, "hot_spots"),
+    ],
+)
+def test_effects_are_held_against_a_scene_that_never_had_them(monkeypatch, effect, free, alone, named):
+    """An unknown by itself that predicts other spots better takes the place of all effects that hold, though
+    they are asked for more, and nothing is gained by it beside them. Not what goes on with one of them, nor
+    where one has a number for each spot, of which others know nothing.
+    """
+    pool = [candidate(effect, 300.0), candidate(free, 150.0)]
+    both = "+".join(sorted((effect, free)))
+    table = {effect: gaining(20.0), free: gaining(alone)}
+    table |= {kind + both: gaining(15.0) for kind in ("", "fine+", "anew+", "fine+anew+")}
+    world = World(monkeypatch, table, pool)
+    found = world.criticise()
+    assert {m.name for m in found.accepted} == found.final.names == {named}
+    assert (frozenset({free}) in [names for names, _ in world.rebuilt]) == (effect == "ambient_map")
+
+
+def test_the_unknown_that_effects_are_held_against_is_the_one_that_may_have_most():
+    """If its scatter is its own; it must be asked for, and be nothing that is there."""
+    world, held = object.__new__(Loop), Member(candidate("ambient_map", 300.0), accepted=True)
+    world.least = LEAST
+    free = [
+        replace(candidate("free_time", LEAST + 9), loud=50.0),
+        replace(candidate("free_rate", LEAST + 0.1), loud=60.0),
+    ]
+
+    def unsaid(members: list[Member], candidates: list[Candidate]) -> str | None:
+        found = world.unsaid(Pool(candidates, []), Held(members, None, None))
+        return found and found.name
+
+    assert unsaid([held], free) == "free_rate"
+    assert unsaid([held], [free[0], replace(free[1], evidence=LEAST - 0.1)]) == "free_time"
+    assert unsaid([held, Member(candidate("free_rate", 60.0))], free) == "free_time"
+    assert unsaid([held], [replace(candidate("free_wall_background", 80.0), loud=80.0)]) is None
+    assert unsaid([held], [candidate("free_spot_gain", 80.0)]) is None
+    assert unsaid([replace(held, accepted=False)], free) is None
+    assert unsaid([Member(candidate("free_wall", 300.0), accepted=True)], free) is None
+
+
 def test_the_better_of_two_scenes_goes_on(monkeypatch):
     """The one that was gone on with, or one from new seeds, where surfels that imitated the terms do not come
     back; none where no surfel survives.
