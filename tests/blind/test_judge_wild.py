@@ -117,3 +117,14 @@ def test_nothing_is_said_of_a_test_set_that_is_not_complete(monkeypatch):
     assert "rates" not in blind.test_set(rows[1:])
     assert "209 of 210 captures have been run" in blind.test_set(rows[1:])
     assert "rates of 210" in blind.test_set(rows)
+
+
+def test_the_test_set_is_run_by_a_commit_alone(monkeypatch, tmp_path):
+    monkeypatch.setattr(blind, "STORE", tmp_path / "outcomes")
+    monkeypatch.setattr(blind, "commit", lambda: "1234567-dirty")
+    with pytest.raises(SystemExit, match="found 1234567-dirty"):
+        blind.run("test", 0, 1, 1)
+    assert not (tmp_path / "outcomes").exists()
+    blind.run("development", 0, 0, 1)
+    monkeypatch.setattr(blind, "commit", lambda: "1234567")
+    blind.run("test", 0, 0, 1)
