@@ -1044,13 +1044,13 @@ def criticise(
     held = beside(start, new)
     instead = None if start.members else loop.unsaid(first_pool, held)
     if instead is not None:
-        known, coarse = found.members, loop.joined(base, [instead])
+        known, pools, coarse = found.members, list(found.pools), loop.joined(base, [instead])
         if loop.predicts(coarse, held.coarse, 1 / (1 + s.odds)):
             other = led_by(instead, first_pool)
             if other.members:
                 held = beside(other, [])
             else:
-                found.members = known
+                found.members, found.pools = known, pools
     found.members, scene = loop.named(*loop.single_spots(found.members, held.scene))
     if found.accepted and loop.predicts(scene, first):
         found.final = scene

@@ -665,6 +665,21 @@ def test_effects_are_held_against_a_scene_that_never_had_them(monkeypatch, effec
     assert (frozenset({free}) in [names for names, _ in world.rebuilt]) == (effect == "ambient_map")
 
 
+def test_all_is_as_it_was_where_the_unknown_does_not_hold(monkeypatch):
+    """It predicts better than the effects, and has less evidence than the misfit asks for."""
+    pool, built = [candidate("ambient_map", 300.0), candidate("free_rate", 50.0)], [frozenset({"free_rate"})]
+    both, told = "ambient_map+free_rate", []
+    for alone in (22.0, 18.0):
+        table = {"ambient_map": gaining(20.0), "free_rate": gaining(alone)}
+        table |= {kind + both: gaining(15.0) for kind in ("", "fine+", "anew+", "fine+anew+")}
+        world = World(monkeypatch, table, pool, misfit=1000.0)
+        found = world.criticise()
+        assert [names for names, _ in world.rebuilt if names == built[0]] == built
+        told.append((names_of(found.members), found.final.names, len(found.pools), found.accepted[0].name))
+    assert told[0] == told[1]
+    assert told[0][-1] == "ambient_map"
+
+
 def test_the_unknown_that_effects_are_held_against_is_the_one_that_may_have_most():
     """If its scatter is its own; it must be asked for, and be nothing that is there."""
     world, held = object.__new__(Loop), Member(candidate("ambient_map", 300.0), accepted=True)
