@@ -15,8 +15,8 @@ from wild_inject import EFFECTS, Hidden
 from wild_scenes import FAMILIES, SIDE
 from wild_unknown import UNKNOWN
 
-# FIXED AT THE FREEZE: no capture of the test set may be looked at before this number is final.
-TEST_MASTER_SEED = 0
+# Fixed with the rules, at 5daba9c: the hash of that commit modulo 1000. Nobody chose it.
+TEST_MASTER_SEED = 482
 MASTER_SEEDS = {"development": 11, "validation": 12, "test": TEST_MASTER_SEED}
 BLOCK = {"null": 100, "single": 70, "pair": 20, "unknown": 20}
 LENGTH = sum(BLOCK.values())
