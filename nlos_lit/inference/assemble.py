@@ -17,6 +17,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.formulas import Formula
 from nlos_lit.effects.free_terms import RATES, Free
+from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import fast
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
@@ -24,7 +25,7 @@ from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.distil import Follower, laid_through
 from nlos_lit.inference.heldout import Comparison, by_block, score
 from nlos_lit.inference.members import Findings, Member, Trial
-from nlos_lit.inference.pool import Candidate
+from nlos_lit.inference.pool import Candidate, null_of
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.result import (
     Accepted,
@@ -43,6 +44,7 @@ from nlos_lit.inference.uncertainty import Uncertainty, uncertainty_of
 from nlos_lit.inference.witness import witness
 from nlos_lit.surfels.fit import SurfelFit
 
+DRAWS = 16  # of fields, of which a mean size is taken
 NINE_OF_TEN = 1.2816  # standard deviations of a score that nine of ten exceed from below
 
 
@@ -261,7 +263,11 @@ def _screened(candidate: Candidate, least: float) -> Screened:
                 if p.size > 1
                 else float((p.null or 0.0) + p.scale * candidate.step[part])
             )
-        detectable[p.name] = p.scale * _visible(error, least, alone=effect.per_spot)
+        visible = _visible(error, least, alone=effect.per_spot)
+        if p.size > 1 and "rms" in effect.quantities() and not effect.per_spot:
+            detectable["rms"] = visible * _rms_of(effect, p)
+        else:
+            detectable[p.name] = p.scale * visible
         start += p.size
     return Screened(
         name=effect.name,
@@ -273,6 +279,15 @@ def _screened(candidate: Candidate, least: float) -> Screened:
         shape=candidate.shape,
         detectable=detectable,
     )
+
+
+def _rms_of(effect: Effect, p: Parameter) -> float:
+    """Root mean square, in its unit, of a field whose stored coefficients are all 1, up or down."""
+    null, rng, squares = null_of(effect), np.random.default_rng(0), []
+    for _ in range(DRAWS):
+        null.set(p.name, torch.from_numpy(p.scale * rng.choice([-1.0, 1.0], p.size)))
+        squares.append(float(null.quantities()["rms"].value.detach()) ** 2)
+    return float(np.mean(squares)) ** 0.5
 
 
 def _visible(error: Tensor, least: float, alone: bool) -> float:

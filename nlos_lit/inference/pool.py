@@ -432,11 +432,18 @@ def above_null(effect: Effect) -> Tensor:
     Returns:
         ``[k]``.
     """
-    return _amplitudes(effect) - _amplitudes(_null_of(effect))
+    return _amplitudes(effect) - _amplitudes(null_of(effect))
 
 
-def _null_of(effect: Effect) -> Effect:
-    """A copy that does nothing."""
+def null_of(effect: Effect) -> Effect:
+    """A copy that does nothing.
+
+    Args:
+        effect: of any strength.
+
+    Returns:
+        another effect, of the same shape.
+    """
     null = copy.deepcopy(effect)
     for p in null.amplitudes:
         null.set(p.name, 0.0 if p.null is None else p.null)
@@ -449,7 +456,7 @@ def _without(problem: Problem, effect: Effect, projector: Projector) -> tuple[Te
     A spot that loses all its light counts nothing by the model, and one count there would weigh without end.
     """
     others = Extension([e for e in problem.extension.effects if e is not effect])
-    given = (problem.model, others, problem.spots, _null_of(effect))
+    given = (problem.model, others, problem.spots, null_of(effect))
     expected, column = expected_and_columns(*given, transients=problem.transients)
     expected, present = expected.clamp_min(FEWEST), problem.expected
     left = projector.residual[: present.numel()].view_as(present) * present.sqrt()

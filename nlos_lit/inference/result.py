@@ -149,7 +149,7 @@ class Screened:
         degrees: coefficients.
         one_step: estimated parameters. shape: scanned ones.
         detectable: the smallest amplitude of each parameter that this capture would reveal in nine of ten
-            cases; of many coefficients, if all are as large.
+            cases; of a field its root mean square, if all of its coefficients are as large.
     """
 
     name: str

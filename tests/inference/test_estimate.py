@@ -500,12 +500,14 @@ def test_screened_in_units_of_the_parameters():
     # k coefficients that are alike need a k-th of the evidence each; those that nothing settles say nothing.
     k = drift.declared["drift"].size
     visible = visible_score(8.3 / k) + 1.2816 / k**0.5
+    rms = float(drift.functions.square().sum(1).mean()) ** 0.5
     assert k > 5
     for known in (k, 5):
         error = torch.full((k,), 0.2)
         error[known:] = 1e6
         found = _screened(Candidate(drift, 30.0, 0.4, 1.0, {}, 2 * torch.ones(k), error, 30.0), 8.3)
-        assert found.detectable["drift"] == pytest.approx(visible * 0.05 * 0.2 * (k / known) ** 0.5)
+        by_hand = visible * 0.05 * 0.2 * (k / known) ** 0.5 * rms
+        assert found.detectable == {"rms": pytest.approx(by_hand, rel=0.1)}
     hot = effect_of("hot_spots", SCAN)
     error = torch.tensor([float("nan"), 2.0, 2.0])
     found = _screened(Candidate(hot, 9.0, 1.0, 1.0, {}, torch.zeros(3), error, 9.0), 8.3)

@@ -22,7 +22,7 @@ from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.tcspc_nonlinearity import waves_at
 from nlos_lit.inference import evidence as evidence_module
 from nlos_lit.inference import pool
-from nlos_lit.inference.assemble import _screened
+from nlos_lit.inference.assemble import _rms_of, _screened
 from nlos_lit.inference.evidence import (
     UNEVENNESS,
     VARIANCES,
@@ -800,10 +800,11 @@ def test_what_is_as_strong_as_its_limit_is_asked_for_in_nine_of_ten(name, known)
     effect, least, found = effect_of(name, SCAN), 8.4, list[bool]()
     (p, *_), size = effect.amplitudes, sum(a.size for a in effect.amplitudes)
     looked = look(name, residuals(torch.zeros(ROWS), seed=5)[0])
-    limit = _screened(looked, least).detectable[p.name] / p.scale
-    for seed in range(6, 12):
+    told, draws = _screened(looked, least).detectable, 15 if effect.shapes else 50
+    limit = told["rms"] / _rms_of(effect, p) if p.size > 1 else told[p.name] / p.scale
+    for seed in range(6, 12):  # of the scores, and of the directions of a field
         coefficients = torch.zeros(size)
         coefficients[: p.size] = limit * (normal(p.size, seed=seed).sign() if p.size > 1 else 1)
-        seen = [look(name, r).evidence > least for r in residuals(columns(effect) @ coefficients, seed)[:50]]
-        found += seen
+        drawn = residuals(columns(effect) @ coefficients, seed)[:draws]
+        found += [look(name, r).evidence > least for r in drawn]
     assert 0.8 < np.mean(found) < 0.97
