@@ -38,7 +38,7 @@ from nlos_lit.inference.members import (
     weighed,
 )
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate, Pool, ahead_of, ask, each_once, lost, own_evidence
+from nlos_lit.inference.pool import Candidate, Pool, ahead_of, ask, each_once, free_along, lost, own_evidence
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps
@@ -574,8 +574,8 @@ class Loop:
         if not effects or any(m.candidate.effect.per_spot for m in effects):
             return None
         does = {m.name for m in held.members}.union(*(m.candidate.effect.followed_by for m in effects))
-        free = [c for c in pool.candidates if c.free and not c.effect.per_spot and c.name not in does]
-        return max((c for c in free if c.evidence > self.least), key=lambda c: c.loud, default=None)
+        asked = [c for c in free_along(pool.candidates, does) if c.evidence > self.least]
+        return max(asked, key=lambda c: c.loud, default=None)
 
     def _bare(self, scene: SurfelFit, gone: list[Member], asked: list[tuple[Member, SurfelFit]]) -> SurfelFit:
         """The scene without members that leave."""

@@ -223,8 +223,20 @@ def foreign(candidates: list[Candidate], least: float) -> Candidate | None:
     if best <= least:
         return None  # free terms are asked for where no effect is
     does = {name for c in effects if c.evidence > MOST * best for name in c.effect.followed_by}
-    free = [c for c in candidates if c.free and not c.effect.per_spot and c.name not in does]
-    return next((c for c in free if c.evidence > best + least), None)
+    return next((c for c in free_along(candidates, does) if c.evidence > best + least), None)
+
+
+def free_along(candidates: list[Candidate], but: Container[str] = ()) -> list[Candidate]:
+    """Free terms that say something of spots that were not fitted.
+
+    Args:
+        candidates: of a pool.
+        but: names of others that are left out.
+
+    Returns:
+        those without a number for each spot, in the same order.
+    """
+    return [c for c in candidates if c.free and not c.effect.per_spot and c.name not in but]
 
 
 def together(
@@ -329,8 +341,7 @@ def ahead_of(effect: Candidate, candidates: list[Candidate]) -> list[Candidate]:
     Returns:
         One term, or none.
     """
-    free = [c for c in candidates if c.free and not c.effect.per_spot]
-    return [c for c in free[:1] if c.evidence > effect.evidence]
+    return [c for c in free_along(candidates)[:1] if c.evidence > effect.evidence]
 
 
 def _seen_again(candidate: Candidate, found: Evidence) -> Candidate:
