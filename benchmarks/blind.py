@@ -36,7 +36,7 @@ def work(set_name: str, index: int) -> dict:
     import torch
     from judge_wild import judge
 
-    from nlos_lit.inference.criticise import CriticismSettings
+    from nlos_lit.inference.settings import CriticismSettings
 
     torch.set_num_threads(1)
     outcome = asdict(judge(set_name, index, CriticismSettings(processes=1))) | {"commit": commit()}
@@ -381,7 +381,7 @@ def holding(row: dict, share: float, level: float, even: float, form: float) -> 
     """
     from nlos_lit.effects import EFFECTS
     from nlos_lit.effects.free_terms import FREE
-    from nlos_lit.inference.criticise import CriticismSettings
+    from nlos_lit.inference.settings import CriticismSettings
 
     now, terms = CriticismSettings(), len(EFFECTS) + len(FREE)
     least, changed = math.log(terms / now.level), math.log(terms / level)
@@ -401,8 +401,8 @@ def sensitivity(set_name: str, commit_of: str) -> None:
     Only what was tried is counted, with what was found when it was last asked for: a term that holds would
     change what comes after it.
     """
-    from nlos_lit.inference.criticise import CriticismSettings
     from nlos_lit.inference.members import EVEN
+    from nlos_lit.inference.settings import CriticismSettings
 
     every = [json.loads(text) for text in ROWS.read_text().splitlines()]
     rows = [r for r in every if (r["set_name"], r["commit"]) == (set_name, commit_of) and "tried" in r]

@@ -35,8 +35,10 @@ def row_of(number: int) -> dict:
     from data_modules.readers import read_capture
     from nlos_lit.capture.scan import Scan
     from nlos_lit.effects.extension import Extension
-    from nlos_lit.inference.criticise import CriticismSettings, Loop
+    from nlos_lit.inference.asking import Asking
     from nlos_lit.inference.pool import Candidate, lit_by
+    from nlos_lit.inference.scenes import Scenes
+    from nlos_lit.inference.settings import CriticismSettings
     from nlos_lit.inference.split import split_spots
     from nlos_lit.runtime.steps import Steps
 
@@ -47,7 +49,8 @@ def row_of(number: int) -> dict:
     pipeline, split = pipeline_for(capture), split_spots(capture)
     base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
     scan = lit_by(base, Scan.of(capture))
-    pool = Loop(pipeline.fit, pipeline.grow, split, scan, CriticismSettings(), 0, Steps()).ask(base, MOST)
+    scenes = Scenes(pipeline.fit, pipeline.grow, split, 0, Steps(), 1)
+    pool = Asking(scenes, scan, CriticismSettings()).ask(base, MOST)
 
     def seen(candidate: Candidate) -> list[float]:
         """Evidence, loud evidence, share that is retained, scatter."""

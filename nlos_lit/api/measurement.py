@@ -18,8 +18,8 @@ from nlos_lit.baselines import METHODS, reconstruct_directed
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError, suggest
 from nlos_lit.capture.volume_grid import volume_grid
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.runtime.arguments import check_overrides
 from nlos_lit.runtime.command_line import quoted
 from nlos_lit.runtime.memory import parse_bytes

@@ -19,9 +19,9 @@ from data_modules.load import load_scene
 from nlos_lit.capture.errors import UserError
 from nlos_lit.commands.composed import compose_and_run
 from nlos_lit.commands.split_with import check_told, second_capture, split_with
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose as diagnose_capture
 from nlos_lit.inference.diagnose import split_of
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.report.diagnosis_figures import diagnosis_figures
 from nlos_lit.report.page import log_figures, write_report
 from nlos_lit.report.verdict import verdict

@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 from data_modules.load import load_scene, planned_scene, read_scene
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.further import ask_further, open_terms
 from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.io.views import read_view
 from nlos_lit.report.explore import page_html
 from nlos_lit.report.page import report_html, write_report

@@ -1,4 +1,4 @@
-"""From the loop's findings to a :class:`~nlos_lit.inference.result.Diagnosis`."""
+"""From the search's findings to a :class:`~nlos_lit.inference.result.Diagnosis`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import fast
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.distil import Follower, laid_through
 from nlos_lit.inference.heldout import Comparison, by_block, score
 from nlos_lit.inference.members import Findings, Member, Trial
@@ -38,6 +37,7 @@ from nlos_lit.inference.result import (
     Tried,
     Unexplained,
 )
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import Split
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import Uncertainty, uncertainty_of
@@ -64,7 +64,7 @@ def assemble(
 
     Args:
         capture: that was diagnosed.
-        found: by the loop.
+        found: by the search.
         split: of its spots.
         scan: of the capture.
         settings: of the criticism.

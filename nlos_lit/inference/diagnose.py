@@ -16,12 +16,14 @@ from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import assemble
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, Loop, criticise
+from nlos_lit.inference.criticise import criticise
 from nlos_lit.inference.distil import distil
 from nlos_lit.inference.kept import kinds
 from nlos_lit.inference.members import Findings, Member
 from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.scenes import Scenes
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import Split, split_spots
 from nlos_lit.inference.toys import run_toys
 from nlos_lit.runtime.steps import Report, Steps
@@ -108,8 +110,9 @@ def diagnose(
         again.counts = base.counts
         return again
 
-    found = criticise(base, rebuild, pipeline.grow, split, scan, options, seed, steps, partial(told, image))
-    followers = distil(Loop(rebuild, pipeline.grow, split, scan, options, seed, steps), found)
+    scenes = Scenes(rebuild, pipeline.grow, split, seed, steps, options.processes)
+    found = criticise(base, scenes, scan, options, partial(told, image))
+    followers = distil(scenes, scan, found)
     null = None
     if options.toys:
         assert folder is not None, "toys are kept in a folder"

@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import Formula, formulas_of
 from nlos_lit.effects.free_terms import Free
-from nlos_lit.inference.criticise import Loop, copy_effects, go_on
-from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.members import Findings
+from nlos_lit.inference.scenes import Scenes, copy_effects, go_on
 from nlos_lit.surfels.fit import SurfelFit
 
 TRIED = 3  # formulas with which the scene goes on
@@ -47,50 +47,50 @@ class Follower:
         return self.share >= KEEPS
 
 
-def distil(loop: Loop, found: Findings) -> dict[str, Follower]:
+def distil(scenes: Scenes, scan: Scan, found: Findings) -> dict[str, Follower]:
     """Formulas of the free terms that were accepted.
 
     Args:
-        loop: whose spots, settings and steps are used.
-        found: by it.
+        scenes: of the capture.
+        scan: of it.
+        found: by the search.
 
     Returns:
         by the free term's name; nothing for one that acts along no single axis, or gains nothing any more.
     """
     followers = {}
     for member in found.accepted:
-        follower = _of_term(loop, found.final, member.name, member.trial.gain.nats)
+        follower = _of_term(scenes, scan, found.final, member.name, member.trial.gain.nats)
         if follower is not None:
             followers[member.name] = follower
     return followers
 
 
-def _of_term(loop: Loop, final: SurfelFit, name: str, gain: float) -> Follower | None:
+def _of_term(scenes: Scenes, scan: Scan, final: SurfelFit, name: str, gain: float) -> Follower | None:
     """The one of a term whose own gain is that."""
-    formulas, spots = formulas_of(name), loop.split.select
+    formulas = formulas_of(name)
     if not formulas or gain <= 0:
         return None
     free = next(e for e in final.extension.effects if e.name == name)
     assert isinstance(free, Free)
     expected = final.model.expected(final.train, final.extension)
-    laid = [lay(formula(loop.scan), free, final.train, expected) for formula in formulas]
+    laid = [lay(formula(scan), free, final.train, expected) for formula in formulas]
     tried = [formula for _, formula in sorted(laid, key=lambda pair: pair[0])][:TRIED]
 
     def with_it(formula: Formula) -> SurfelFit:
         effects = [e for e in final.extension.effects if e.name != name]
-        fit = final.copy(copy_effects(Extension(effects), [formula]), loop.seed)
+        fit = final.copy(copy_effects(Extension(effects), [formula]), scenes.seed)
         fit.match_energy()  # a constant is none of a formula's, and may have been of the term's
         return go_on(fit)
 
-    jobs = [(f"going on without {name}", f"all_but_{name}", partial(loop.without, final, [name]))]
+    jobs = [(f"going on without {name}", f"all_but_{name}", partial(scenes.without, final, [name]))]
     for formula in tried:
         text, kept = f"going on with {formula.name}", f"{formula.name}_for_{name}"
         jobs.append((text, kept, partial(with_it, formula)))
-    loop.steps.plan(fit=len(jobs))
-    neither, *fits = loop.steps.several("fit", jobs, loop.settings.processes)
-    values = [float(log_likelihood(fit, spots).sum()) for fit in fits]
+    neither, *fits = scenes.several(jobs)
+    values = [float(scenes.value(fit).sum()) for fit in fits]
     best = max(range(len(tried)), key=lambda k: values[k])
-    kept_of_it = (values[best] - float(log_likelihood(neither, spots).sum())) / gain
+    kept_of_it = (values[best] - float(scenes.value(neither).sum())) / gain
     return Follower(tried[best].name, fits[best], kept_of_it)
 
 

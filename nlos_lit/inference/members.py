@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from torch import Tensor
@@ -149,9 +150,17 @@ class Member:
         return next(t for t in self.trials if t.name == self.name)
 
 
+class Held(NamedTuple):
+    """Terms that hold, the scene with them, and the parsimonious one."""
+
+    members: list[Member]
+    scene: SurfelFit
+    coarse: SurfelFit
+
+
 @dataclass
 class Findings:
-    """What the loop leaves behind.
+    """What the search leaves behind.
 
     Args:
         base: the fine fit without effects.

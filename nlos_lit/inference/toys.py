@@ -22,8 +22,8 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.foreign import bounded
 from nlos_lit.capture.scan import Scan
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.pool import ask
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Report
 from nlos_lit.surfels.fit import SurfelFit

@@ -19,7 +19,7 @@ SCAN, SENSOR = (
 ARGUMENTS = (
     ("model", "nlos_lit/model/build.py", "PipelineSettings"),
     ("surfels", "nlos_lit/surfels/fit.py", "SurfelSettings"),
-    ("criticism", "nlos_lit/inference/criticise.py", "CriticismSettings"),
+    ("criticism", "nlos_lit/inference/settings.py", "CriticismSettings"),
     ("scene.simulate.scan", *SCAN),
     ("scene.simulate.sensor", *SENSOR),
     ("method.options", "nlos_lit/baselines/rsd.py", "rsd"),

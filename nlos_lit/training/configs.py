@@ -20,7 +20,7 @@ from omegaconf import OmegaConf
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import volume_grid
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.places import CONF
 from nlos_lit.runtime.arguments import check_values

@@ -17,11 +17,12 @@ from blind_truth import Spec, Truth, make_capture
 from data_modules.readers import read_capture
 from nlos_lit.capture import Capture
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, begun_with, solve_spots
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
 from nlos_lit.inference.members import Findings
 from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.scenes import begun_with, solve_spots
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import split_spots
 from nlos_lit.model.build import PipelineSettings
 from nlos_lit.surfels.fit import SurfelSettings

@@ -19,11 +19,11 @@ from wild_truth import Truth, make
 
 from data_modules.readers import read_capture
 from nlos_lit.capture import Capture
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.diagnose import diagnose, split_of
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.members import Findings
 from nlos_lit.inference.result import Diagnosis
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.metrics.transients import transient_scores
 
 

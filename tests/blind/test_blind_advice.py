@@ -11,9 +11,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.advise import AGAIN, expected_nats
-from nlos_lit.inference.criticise import begun_with, copy_effects, go_on
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.pool import ask, lit_by
+from nlos_lit.inference.scenes import begun_with, copy_effects, go_on
 from nlos_lit.inference.split import split_spots
 from nlos_lit.surfels.fit import SurfelFit
 

@@ -11,7 +11,7 @@ import pytest
 from blind_judge import Outcome, run_case
 from blind_truth import CASES, Spec
 
-from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference.settings import CriticismSettings
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")
 # Fewer spots and terms than a diagnosis takes.

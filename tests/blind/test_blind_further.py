@@ -22,12 +22,13 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.assemble import facts_of, nats_by_block, tried_with
 from nlos_lit.inference.base_pipeline import BasePipeline
-from nlos_lit.inference.criticise import CriticismSettings, begun_with, go_on
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.further import ask_further, open_terms
 from nlos_lit.inference.heldout import log_likelihood, weights
 from nlos_lit.inference.pool import ask, lit_by
 from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Gain, Scores, Unexplained
+from nlos_lit.inference.scenes import begun_with, go_on
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.report.page import report_html
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

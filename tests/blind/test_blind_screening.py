@@ -18,8 +18,8 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS as NAMES
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.pool import ask
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import split_spots
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")

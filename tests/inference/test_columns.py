@@ -26,7 +26,6 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.effects.nominal import nominal_scan
 from nlos_lit.functional.irf import emg_cdf
-from nlos_lit.inference.criticise import copy_effects
 from nlos_lit.inference.evidence import Projector
 from nlos_lit.inference.problem import (
     _by_bin,
@@ -38,6 +37,7 @@ from nlos_lit.inference.problem import (
     towards_wall,
     weighted_columns,
 )
+from nlos_lit.inference.scenes import copy_effects
 from nlos_lit.surfels.model import SurfelModel, inverse_softplus
 
 pytestmark = FORWARD_MODE

@@ -20,8 +20,8 @@ from data_modules.readers import write_capture
 from nlos_lit.commands.simulate import simulate
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Gain, Tried
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.io.files import write_json
 from nlos_lit.io.views import read_view
 

@@ -11,10 +11,10 @@ from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference import criticise
-from nlos_lit.inference.criticise import CriticismSettings, Loop
+from nlos_lit.inference import scenes as module
 from nlos_lit.inference.distil import Follower, distil, laid_through
-from nlos_lit.inference.heldout import Comparison, compare, log_likelihood
+from nlos_lit.inference.heldout import Comparison, compare
+from nlos_lit.inference.scenes import Scenes
 from nlos_lit.inference.split import split_spots
 from nlos_lit.runtime.steps import Steps
 
@@ -26,7 +26,7 @@ ORDER = np.random.default_rng(5).permutation(SIDE**2)  # of acquisition
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Twelve surfels need few batches."""
-    monkeypatch.setattr(criticise, "WARM", 40)
+    monkeypatch.setattr(module, "WARM", 40)
 
 
 def followed(factor: np.ndarray) -> dict[str, Follower]:
@@ -40,9 +40,9 @@ def followed(factor: np.ndarray) -> dict[str, Follower]:
     scan, split = Scan.of(measured), split_spots(measured)
     fit = fit_of(model, measured, Extension([effect_of("free_scan", scan)]), split.fit)
     fit.go_on(200)
-    loop = Loop(None, None, split, scan, CriticismSettings(processes=1), 0, Steps())
-    value, less = (log_likelihood(f, split.select) for f in (fit, loop.without(fit, ["free_scan"])))
-    return distil(loop, accepting(fit, "free_scan", compare(less, value, loop.block)))
+    scenes = Scenes(None, None, split, 0, Steps(), 1)
+    value, less = (scenes.value(f) for f in (fit, scenes.without(fit, ["free_scan"])))
+    return distil(scenes, scan, accepting(fit, "free_scan", compare(less, value, scenes.block)))
 
 
 def accepting(fit: object, term: str, gain: Comparison) -> SimpleNamespace:
@@ -75,8 +75,7 @@ def test_what_follows_no_formula_is_not_offered():
 
 
 def test_a_map_of_the_wall_follows_no_formula_of_one_axis():
-    loop = SimpleNamespace(settings=None, split=SimpleNamespace(select=None))
-    assert distil(loop, accepting(None, "free_wall", Comparison(50.0, 1.0, (48.0, 52.0)))) == {}
+    assert distil(None, None, accepting(None, "free_wall", Comparison(50.0, 1.0, (48.0, 52.0)))) == {}
 
 
 @pytest.mark.parametrize(("share", "offered"), [(0.899, False), (0.9, True)])

@@ -20,7 +20,6 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import pool
 from nlos_lit.inference.advise import plans
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
-from nlos_lit.inference.criticise import CriticismSettings
 from nlos_lit.inference.evidence import (
     UNEVENNESS,
     Projector,
@@ -33,6 +32,7 @@ from nlos_lit.inference.pool import Candidate, Pool, own_evidence
 from nlos_lit.inference.problem import Problem, build_problem, weighted_columns
 from nlos_lit.inference.residuals import SIDE
 from nlos_lit.inference.result import Likely
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import split_spots
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import UNLIKE, Uncertainty

@@ -14,7 +14,7 @@ from scipy import integrate
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference.criticise import misfit_of
+from nlos_lit.inference.asking import misfit_of
 from nlos_lit.inference.heldout import log_likelihood
 from nlos_lit.inference.per_spot import (
     best_width,

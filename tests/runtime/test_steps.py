@@ -17,9 +17,9 @@ from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
-from nlos_lit.inference import criticise
-from nlos_lit.inference.criticise import CriticismSettings
+from nlos_lit.inference import scenes
 from nlos_lit.inference.diagnose import diagnose
+from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.runtime import steps as module
 from nlos_lit.runtime.steps import Steps
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
@@ -152,7 +152,7 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
     scene = capture_of(raster(16))
     hidden = effect_of("irf_tail", Scan.of(scene), fraction=0.5, decay=0.1)
     scene = drawn(surfels(scene, level=4.0), Extension([hidden]), scene)
-    monkeypatch.setattr(criticise, "WARM", 3)
+    monkeypatch.setattr(scenes, "WARM", 3)
     options = CriticismSettings(spots=96, rivals=2, most=1, processes=1)
     texts = []
 
