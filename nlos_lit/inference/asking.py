@@ -76,8 +76,15 @@ class Asking:
         return self.steps("screen", f"{text}, {turn}", f"pool{turn}", asking)
 
     def beside(self, fine: SurfelFit, name: str, kept: str) -> float:
-        """Nats that a term has beside a fine scene without it: cells too wide for a scene ask for terms that
-        it does not need. The step is kept as ``kept``.
+        """Nats that a term has beside a fine scene: cells too wide for a scene ask for terms it does not need.
+
+        Args:
+            fine: the scene, without the term.
+            name: of the term.
+            kept: name of the step.
+
+        Returns:
+            its evidence.
         """
         asking = partial(self._ask, fine, 0, True, {name})
         (found,) = self.steps("screen", f"asking for {name}", kept, asking).candidates
@@ -91,8 +98,16 @@ class Asking:
     def own(
         self, scene: SurfelFit, names: list[str], kept: str
     ) -> tuple[dict[str, tuple[float, float, float]], list[str]]:
-        """Own evidence of some terms of a scene with what they need there, and who is left when all who have
-        less are gone. The step is kept as ``kept``.
+        """Own evidence of some terms of a scene.
+
+        Args:
+            scene: with the terms.
+            names: of them.
+            kept: name of the step.
+
+        Returns:
+            By name nats, those needed, and those of these for what other terms take; and who is left when all
+            who have less than they need are gone.
         """
         bar = partial(self._bar, self.misfit(scene))
         asking = partial(own_evidence, scene, self.split, self.settings.spots, self.seed, names, bar)

@@ -141,7 +141,15 @@ class Scenes:
         return weights([self.value(other), self.value(scene)], self.block)[1] > least
 
     def several(self, jobs: Sequence[Job], screen: int = 0) -> list[SurfelFit]:
-        """Fits that do not depend on one another, with so many questions to come after them."""
+        """Fits that do not depend on one another, side by side.
+
+        Args:
+            jobs: steps that make them.
+            screen: questions that come after them, for the time that is left.
+
+        Returns:
+            one a job.
+        """
         self.steps.plan(fit=len(jobs), screen=screen)
         return self.steps.several("fit", jobs, self.processes)
 
@@ -158,7 +166,15 @@ class Scenes:
         return go_on(fit.copy(begun_with(fit, extra), self.seed))
 
     def gone_on(self, fit: SurfelFit, new: list[Candidate]) -> SurfelFit:
-        """:meth:`warm` as a step of its own."""
+        """:meth:`warm` as a step of its own.
+
+        Args:
+            fit: that is copied.
+            new: the terms.
+
+        Returns:
+            another fit.
+        """
         names = [c.name for c in new]
         kept = f"on{self.turn}_{'_'.join(names)}"
         return self.steps("fit", f"going on with {', '.join(names)}", kept, partial(self.warm, fit, new))
@@ -177,7 +193,16 @@ class Scenes:
         return go_on(fit.copy(Extension(fewer), self.seed))
 
     def parted(self, fit: SurfelFit, names: Sequence[str], kept: str) -> SurfelFit:
-        """:meth:`without` as a step of its own, kept as ``kept``."""
+        """:meth:`without` as a step of its own.
+
+        Args:
+            fit: that is copied.
+            names: of the terms that leave.
+            kept: name of the step.
+
+        Returns:
+            another fit.
+        """
         text = f"going on without {', '.join(names)}"
         return self.steps("fit", text, kept, partial(self.without, fit, names))
 
@@ -195,17 +220,41 @@ class Scenes:
         return self.parted(fit, others, f"only{self.turn}_{'_'.join(names)}") if others else fit
 
     def solved(self, fit: SurfelFit, new: Candidate) -> SurfelFit:
-        """The same scene with a term of single spots, and nothing moved: batches may make it worse."""
+        """The same scene with a term of single spots, and nothing moved: batches may make it worse.
+
+        Args:
+            fit: that is copied.
+            new: the term.
+
+        Returns:
+            another fit.
+        """
         text, kept = f"solving for {new.name}", f"solved{self.turn}_{new.name}"
         return self.steps("fit", text, kept, lambda: solve_spots(fit.copy(begun_with(fit, [new]), self.seed)))
 
     def refining(self, fit: SurfelFit, name: str) -> Job:
-        """The scene as fine as the counts ask for, with the fit's terms, as a step of that name."""
+        """The step that makes a scene as fine as the counts ask for, with the fit's terms.
+
+        Args:
+            fit: parsimonious.
+            name: of the step.
+
+        Returns:
+            the step, not done yet.
+        """
         text, kept = f"refining the scene {name.replace('_', ' ')}", f"fine{self.turn}_{name}"
         return text, kept, lambda: solve_spots(self.grow(fit, self.seed))
 
     def fine(self, fit: SurfelFit, name: str) -> SurfelFit:
-        """:meth:`refining`, done."""
+        """A scene as fine as the counts ask for, with the fit's terms.
+
+        Args:
+            fit: parsimonious.
+            name: of the step.
+
+        Returns:
+            another fit.
+        """
         return self.steps("fit", *self.refining(fit, name))
 
     def grown(self, coarse: SurfelFit, name: str) -> SurfelFit:
@@ -238,7 +287,15 @@ class Scenes:
         return fit if other is None else self.better(other, fit)
 
     def built_or(self, other: SurfelFit, extension: Extension) -> SurfelFit:
-        """A scene built with the effects, or the other, where no surfel survives with them."""
+        """A scene built with effects.
+
+        Args:
+            other: a scene.
+            extension: the effects.
+
+        Returns:
+            A new fit, or the other, where no surfel survives with the effects.
+        """
         fit = self.anew(extension)
         return other if fit is None else fit
 
@@ -275,7 +332,15 @@ class Scenes:
         return self.steps("fit", text, kept, partial(self.or_anew, self.only(coarse, names)))
 
     def built_without(self, coarse: SurfelFit, name: str) -> SurfelFit:
-        """A parsimonious scene without a term: gone on with, or built anew, whichever predicts better."""
+        """A parsimonious scene without a term: gone on with, or built anew, whichever predicts better.
+
+        Args:
+            coarse: with the term.
+            name: of the term.
+
+        Returns:
+            another fit.
+        """
         return self.or_anew(self.without(coarse, [name]))
 
     def whole(self, coarse: SurfelFit) -> SurfelFit:

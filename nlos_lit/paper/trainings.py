@@ -115,7 +115,7 @@ def state_of(run: Run, spot: int) -> dict[str, Any]:
     """
     pipeline, capture = run.module.pipeline, run.capture
     grid = pipeline.phasor.grid
-    points = surface_points(run.module, capture, shown_spots(capture.n_spots, VISIBLE))
+    points = surface_points(pipeline, capture, shown_spots(capture.n_spots, VISIBLE))
     rendering = pipeline(torch.tensor([spot]))
     errors: dict[str, Any] = {}
     if run.truth is not None:

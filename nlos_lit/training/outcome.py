@@ -87,14 +87,14 @@ def write_results(
         albedo = pipeline.albedo(volume)
     grid = pipeline.phasor.grid
     write_volume(folder / "volume.h5", volume.cpu().numpy(), grid, albedo=albedo.cpu().numpy())
-    points = surface_points(module, capture, shown_spots(capture.n_spots, config["export"]["spots"]))
+    points = surface_points(pipeline, capture, shown_spots(capture.n_spots, config["export"]["spots"]))
     write_points(folder / "points.ply", points)
     write_depth(folder / "depth.npy", depth_map(points, grid.x, grid.y))
     mesh = write_mesh(folder / "mesh.ply", points, depth=config["export"]["mesh_depth"])
     if mesh.reason:
         log.warning("mesh.ply: %s", mesh.reason)
     geometry = geometry_of(points, run)
-    shown = run_figures(module, capture, shown_spots(capture.n_spots, config["export"]["transients"]))
+    shown = run_figures(pipeline, capture, shown_spots(capture.n_spots, config["export"]["transients"]))
     if geometry is not None and run.truth is not None:
         x, y = run.truth.x, run.truth.y
         shown["depth_error"] = figures.depth_error_map(depth_map(points, x, y), run.truth.depth, x, y)

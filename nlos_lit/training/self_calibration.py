@@ -146,7 +146,7 @@ class SelfCalibration(CaptureFit):
 
     def figures(self, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
         """Kernel, transients, volume, albedo, surface: :func:`~nlos_lit.training.shown.run_figures`."""
-        return run_figures(self, capture, spots)
+        return run_figures(self.pipeline, capture, spots)
 
     def hold(self) -> None:
         """Keep the volume; processes that share its field do so together."""
@@ -158,7 +158,7 @@ class SelfCalibration(CaptureFit):
 
     def first_figures(self) -> dict[str, Figure]:
         """The volume before the first iteration."""
-        return {"volume_first": first_volume(self)}
+        return {"volume_first": first_volume(self.pipeline)}
 
     def on_validation_epoch_start(self) -> None:
         """Empty the sums, keep the volume: parameters stand still meanwhile."""

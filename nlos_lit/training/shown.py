@@ -16,7 +16,7 @@ from nlos_lit.report import figures
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from nlos_lit.training.self_calibration import SelfCalibration
+    from nlos_lit.model.pipeline import Pipeline
 
 GOLDEN = 0.6180339887498949  # its multiples fill the unit interval evenly
 
@@ -108,19 +108,18 @@ def spot_residuals(
 
 
 @torch.no_grad()
-def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
+def run_figures(pipeline: Pipeline, capture: Capture, spots: np.ndarray) -> dict[str, Figure]:
     """Figures of the present state of a run.
 
     Args:
-        module: the run's, its phasor field prepared.
+        pipeline: the run's, its phasor field prepared.
         capture: what is fitted.
         spots: ``[K]`` spots whose transients and surface are shown.
 
     Returns:
         ``volume``, ``albedo``, ``transients``, ``kernel``, ``laser_sensor`` and ``surface`` → figure.
     """
-    pipeline = module.pipeline
-    index = torch.from_numpy(spots).to(module.device)
+    index = torch.from_numpy(spots).to(pipeline.sensor.device)
     rendering = pipeline(index)
     grid = pipeline.phasor.grid
     volume, albedo = rendering.intensity.cpu().numpy(), rendering.albedo.cpu().numpy()
@@ -135,27 +134,27 @@ def run_figures(module: SelfCalibration, capture: Capture, spots: np.ndarray) ->
         "laser_sensor": figures.laser_sensor_plot(
             psi, capture.bin_length, first=-sensor.lead * capture.bin_length
         ),
-        "surface": figures.surface_plot(surface_points(module, capture, spots)),
+        "surface": figures.surface_plot(surface_points(pipeline, capture, spots)),
     }
 
 
 @torch.no_grad()
-def first_volume(module: SelfCalibration) -> Figure:
+def first_volume(pipeline: Pipeline) -> Figure:
     """The volume as it is before the first iteration."""
-    phasor = module.pipeline.phasor
-    title, threshold = "intensity before the first iteration", module.pipeline.geometry.threshold
+    phasor = pipeline.phasor
+    title, threshold = "intensity before the first iteration", pipeline.geometry.threshold
     return figures.volume_projections(phasor().cpu().numpy(), phasor.grid, threshold=threshold, title=title)
 
 
 @torch.no_grad()
-def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray, block: int = 16) -> Points:
+def surface_points(pipeline: Pipeline, capture: Capture, spots: np.ndarray, block: int = 16) -> Points:
     """The surface seen from the scanned wall points of some spots.
 
     Where one sensor point serves all spots, the laser points look in its stead: the volume can be seen from
     anywhere.
 
     Args:
-        module: the run's, its phasor field prepared.
+        pipeline: the run's, its phasor field prepared.
         capture: what is fitted.
         spots: ``[K]`` rows of the capture.
         block: spots at once.
@@ -163,14 +162,13 @@ def surface_points(module: SelfCalibration, capture: Capture, spots: np.ndarray,
     Returns:
         Points, normals and albedos in world coordinates, m.
     """
-    pipeline = module.pipeline
     volume = pipeline.phasor()
     albedo = pipeline.albedo(volume)
     end = "laser" if capture.kind == "single_sensor" else "sensor"
     origins, normals = getattr(pipeline, end), getattr(pipeline, f"{end}_normal")
     parts: list[tuple[np.ndarray, ...]] = []
     for first in range(0, len(spots), block):
-        index = torch.from_numpy(spots[first : first + block]).to(module.device)
+        index = torch.from_numpy(spots[first : first + block]).to(pipeline.sensor.device)
         surface = pipeline.surface(volume, origins[index], normals[index])
         met = surface.normal.any(1)  # off the CPU there are rows to spare, without a normal
         point, normal = surface.point[met], surface.normal[met]

@@ -4,8 +4,6 @@ the host.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import literal
 import numpy as np
 import pytest
@@ -71,8 +69,7 @@ def test_points_that_are_shown_are_the_same(name):
     made, shown = world(name), {}
     for static in (False, True):
         made.pipeline.geometry.wants_static = static
-        module = SimpleNamespace(pipeline=made.pipeline, device=torch.device("cpu"))
-        points = surface_points(module, made.capture, np.arange(made.capture.n_spots), block=4)
+        points = surface_points(made.pipeline, made.capture, np.arange(made.capture.n_spots), block=4)
         rows = np.column_stack([points.positions, points.normals, points.albedo])
         shown[static] = rows[np.lexsort(np.round(rows[:, :3], 4).T)]
     assert len(shown[True]) == len(shown[False]) > 50
