@@ -76,7 +76,7 @@ class Asking:
         return self.steps("screen", f"{text}, {turn}", f"pool{turn}", asking)
 
     def beside(self, fine: SurfelFit, name: str, kept: str) -> float:
-        """Nats that a term has beside a fine scene: cells too wide for a scene ask for terms it does not need.
+        """Nats of a term beside a fine scene: cells that are too wide ask for terms that it does not need.
 
         Args:
             fine: the scene, without the term.
