@@ -3,7 +3,7 @@
     python benchmarks/blind.py run set=development first=0 number=40    diagnoses, stored as they are done
     python benchmarks/blind.py rows set=validation                   its rows into docs/blind_rows.jsonl
     python benchmarks/blind.py values                                   true quantities into rows without them
-    python benchmarks/blind.py report                                   docs/blind.md from those rows
+    python benchmarks/blind.py report                                   tables of docs/ from those rows
     python benchmarks/blind.py sensitivity set=development commit=…     what other constants would have said
 
 Development captures may be looked at as often as one likes, validation captures when a design is finished;
@@ -29,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind")]
 STORE = ROOT / "benchmarks" / "results" / "blind"
 ROWS = ROOT / "docs" / "blind_rows.jsonl"
 MARK = "<!-- measured: python benchmarks/blind.py report -->"
+LAST = 8  # looks that are counted together
 
 
 def work(set_name: str, index: int) -> dict:
@@ -352,26 +353,41 @@ def test_set(rows: list[dict]) -> str:
     return f"{head}{rates(rows)}\n\n{captures(rows)}\n"
 
 
+def rewrite(page: str, parts: list[str]) -> None:
+    """Tables of a page of docs, below its mark."""
+    file = ROOT / "docs" / page
+    file.write_text(file.read_text().split(MARK)[0] + MARK + "\n\n" + "\n".join(parts))
+
+
 def report() -> None:
-    """Rewrite the tables of docs/blind.md."""
+    """Rewrite the tables of docs/blind.md and docs/looks.md."""
     cases = [json.loads(text) for text in ROWS.read_text().splitlines()]
     test, validation, development = (
         [c for c in cases if c["set_name"] == name] for name in ("test", "validation", "development")
     )
     looks = looks_of(validation)
+    last = [case for rows in list(looks.values())[:LAST] for case in rows]
+    first, end = (choose(c["index"] for c in last) for choose in (min, max))
+    rewrite(
+        "blind.md",
+        [
+            test_set(test),
+            f"## The last {LAST} looks at the validation set, together\n\n"
+            f"Captures {first} – {end}, each look by another state of the program, all older than the\n"
+            f"frozen rules.\n\n{rates(last)}\n",
+        ],
+    )
     newest = {c["index"]: c for c in development}
-    parts = [test_set(test)]
-    parts += [f"## The last look at the validation set\n\n{rates(next(iter(looks.values())))}\n"]
-    parts += [f"## All looks at the validation set, the last first\n\n{side_by_side(looks)}\n"]
-    parts += [f"## Captures of the validation set\n\n{captures(validation)}\n"]
-    parts += [
-        "## Captures of the development set, as they were last run\n\n"
-        "No rates: rules were chosen on these captures. Rows of earlier commits are in\n"
-        f"[blind_rows.jsonl](blind_rows.jsonl).\n\n{captures(list(newest.values()))}\n"
-    ]
-    page = ROOT / "docs" / "blind.md"
-    head = page.read_text().split(MARK)[0]
-    page.write_text(head + MARK + "\n\n" + "\n".join(parts))
+    rewrite(
+        "looks.md",
+        [
+            f"## All looks, the last first\n\n{side_by_side(looks)}\n",
+            f"## Captures of the validation set\n\n{captures(validation)}\n",
+            "## Captures of the development set, as they were last run\n\n"
+            "No rates: rules were chosen on these captures. Rows of earlier commits are in\n"
+            f"[blind_rows.jsonl](blind_rows.jsonl).\n\n{captures(list(newest.values()))}\n",
+        ],
+    )
 
 
 def holding(row: dict, share: float, level: float, even: float, form: float) -> set[str]:
