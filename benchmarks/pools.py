@@ -36,7 +36,8 @@ def row_of(number: int) -> dict:
     from nlos_lit.capture.scan import Scan
     from nlos_lit.effects.extension import Extension
     from nlos_lit.inference.asking import Asking
-    from nlos_lit.inference.pool import Candidate, lit_by
+    from nlos_lit.inference.candidates import Candidate
+    from nlos_lit.inference.pool import lit_by
     from nlos_lit.inference.scenes import Scenes
     from nlos_lit.inference.settings import CriticismSettings
     from nlos_lit.inference.split import split_spots

@@ -65,8 +65,8 @@ def unevenness(fitted: Tensor, true: Tensor, towards: Tensor, group: Tensor) -> 
 def asked(fit, split) -> float:
     """The deviation that the pool takes 32 patches to have, from the counts."""
     from nlos_lit.inference.evidence import UNEVENNESS, Projector
-    from nlos_lit.inference.pool import patches_for, tested_rows
     from nlos_lit.inference.problem import build_problem
+    from nlos_lit.inference.tested import patches_for, tested_rows
 
     rows = tested_rows(fit, split, most=1024, seed=0)
     counts, spots = fit.counts[rows], torch.from_numpy(split.fit[rows])

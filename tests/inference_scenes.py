@@ -16,7 +16,7 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.pool import Candidate
+from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.problem import Problem
 from nlos_lit.model.parameters import BoundedParameter
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings

@@ -12,8 +12,10 @@ import torch
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.free_terms import FREE
+from nlos_lit.inference.candidates import Pool
 from nlos_lit.inference.heldout import score
-from nlos_lit.inference.pool import Pool, ask, own_evidence
+from nlos_lit.inference.own import own_evidence
+from nlos_lit.inference.pool import ask
 from nlos_lit.inference.scenes import Scenes, copy_effects, solve_spots
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.surfels.fit import SurfelFit

@@ -21,10 +21,11 @@ from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.smooth import fast
 from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
+from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.distil import Follower, laid_through
 from nlos_lit.inference.heldout import Comparison, by_block, score
 from nlos_lit.inference.members import Findings, Member, Trial
-from nlos_lit.inference.pool import Candidate, null_of
+from nlos_lit.inference.own import null_of
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.result import (
     Accepted,

@@ -8,8 +8,8 @@ from functools import partial
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.candidates import Candidate, Pool
 from nlos_lit.inference.members import SURE, Held, Member
-from nlos_lit.inference.pool import Candidate, Pool
 from nlos_lit.inference.scenes import Scenes, copy_effects
 from nlos_lit.surfels.fit import SurfelFit
 

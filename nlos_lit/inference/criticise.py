@@ -12,9 +12,9 @@ from dataclasses import replace
 from nlos_lit.capture.scan import Scan
 from nlos_lit.inference.asking import Asking
 from nlos_lit.inference.beginning import begun
+from nlos_lit.inference.candidates import Candidate, Pool, ahead_of, each_once, free_along, lost
 from nlos_lit.inference.holding import Holding
 from nlos_lit.inference.members import Findings, Held, Member, unknown_beside
-from nlos_lit.inference.pool import Candidate, Pool, ahead_of, each_once, free_along, lost
 from nlos_lit.inference.scenes import Scenes
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.surfels.fit import SurfelFit

@@ -26,9 +26,10 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.inference.assemble import facts_of, nats_by_block, tried_with
 from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.diagnose import split_of
 from nlos_lit.inference.heldout import log_likelihood, weights
-from nlos_lit.inference.pool import Candidate, ask, lit_by
+from nlos_lit.inference.pool import ask, lit_by
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.result import Accepted, Diagnosis, Estimate, Further, Tried
 from nlos_lit.inference.scenes import begun_with, copy_effects, go_on, solve_spots

@@ -13,7 +13,7 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.formulas import FORMULAS
 from nlos_lit.effects.free_terms import FREE
-from nlos_lit.inference.pool import Candidate, Pool, Taken
+from nlos_lit.inference.candidates import Candidate, Pool, Taken
 from nlos_lit.runtime.plain_file import Kind, record
 from nlos_lit.surfels.fit import SurfelFit, SurfelSettings
 

@@ -10,8 +10,8 @@ import numpy as np
 from torch import Tensor
 
 from nlos_lit.effects.free_terms import FREE_NAMES
+from nlos_lit.inference.candidates import MOST, Candidate, Pool
 from nlos_lit.inference.heldout import Comparison, weights
-from nlos_lit.inference.pool import MOST, Candidate, Pool
 from nlos_lit.surfels.fit import SurfelFit
 
 # Of what select spots leave unexplained without a term. A free term that explains more, with this weight,

@@ -13,10 +13,10 @@ from torch import Tensor
 from nlos_lit.capture.errors import UserError
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.heldout import log_likelihood, weights
 from nlos_lit.inference.members import EVEN
 from nlos_lit.inference.per_spot import solve
-from nlos_lit.inference.pool import Candidate
 from nlos_lit.inference.problem import acting_order
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Steps

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from nlos_lit.effects.effect import Effect
 from nlos_lit.inference.evidence import Projector
-from nlos_lit.inference.pool import above_null, patches_for, tested_rows
+from nlos_lit.inference.own import above_null
 from nlos_lit.inference.problem import build_problem, weighted_columns
 from nlos_lit.inference.result import Estimate
 from nlos_lit.inference.split import Split
+from nlos_lit.inference.tested import patches_for, tested_rows
 from nlos_lit.surfels.fit import SurfelFit
 
 REACH = 3.0  # standard errors over which quantities are displaced

@@ -23,9 +23,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects import EFFECTS, Effect, build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES
-from nlos_lit.inference.pool import screen
 from nlos_lit.inference.problem import build_problem
 from nlos_lit.inference.result import Accepted, Estimate, Gain
+from nlos_lit.inference.screening import screen
 from nlos_lit.report.page import report_html, write_report
 from nlos_lit.report.quantities import headline
 from nlos_lit.report.verdict import verdict

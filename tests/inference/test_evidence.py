@@ -21,8 +21,9 @@ from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.parameter import Parameter
 from nlos_lit.effects.tcspc_nonlinearity import waves_at
 from nlos_lit.inference import evidence as evidence_module
-from nlos_lit.inference import pool
+from nlos_lit.inference import pool, screening
 from nlos_lit.inference.assemble import _rms_of, _screened
+from nlos_lit.inference.candidates import Candidate, Shape
 from nlos_lit.inference.evidence import (
     UNEVENNESS,
     VARIANCES,
@@ -34,8 +35,8 @@ from nlos_lit.inference.evidence import (
     prior_deviations,
 )
 from nlos_lit.inference.per_spot import neighbours
-from nlos_lit.inference.pool import Candidate, Shape, screen
 from nlos_lit.inference.problem import Problem
+from nlos_lit.inference.screening import screen
 
 SPOTS, BINS, DRAWS = 42, 6, 200
 ROWS = SPOTS * BINS
@@ -373,8 +374,9 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, columns: Callable[..., Tensor]) ->
             effect.set_all(shape)
             yield columns(problem, effect)
 
-    monkeypatch.setattr(pool, "weighted_columns", columns)
-    monkeypatch.setattr(pool, "columns_at", at_each)
+    for module in (pool, screening):
+        monkeypatch.setattr(module, "weighted_columns", columns)
+    monkeypatch.setattr(screening, "columns_at", at_each)
 
 
 @pytest.fixture
@@ -501,8 +503,8 @@ def widths_of_bins(residual: Tensor) -> Candidate:
             yield 3 * 0.02 * waves_at(bins, effect.value("period").detach()).repeat(len(BLOCK), 1)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pool, "columns_at", at_each)
-        patch.setattr(pool, "weighted_columns", lambda p, e: next(at_each(p, e, [{}])))
+        patch.setattr(screening, "columns_at", at_each)
+        patch.setattr(screening, "weighted_columns", lambda p, e: next(at_each(p, e, [{}])))
         x = normal(rows, 7, seed=1)
         whole = problem_of(BLOCK, torch.full((len(BLOCK), len(bins)), 9.0), x, residual)
         (candidate,) = screen(whole, [effect_of("tcspc_nonlinearity", SCAN)], BLOCK)
@@ -570,7 +572,7 @@ def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enoug
         loud = look("ripple", strength * truth + noise)
         on_grid = min(abs(loud.shape["period"] - p) for p in grid) < 1e-6
         assert on_grid == (loud.loud - math.log(len(grid)) < pool.CLOSER)
-    monkeypatch.setattr(pool, "HALVINGS", 0)
+    monkeypatch.setattr(screening, "HALVINGS", 0)
     coarse = look("ripple", truth + noise)
     assert coarse.shape["period"] == grid[4]
     assert found.evidence > 1.02 * coarse.evidence
@@ -581,7 +583,7 @@ def test_terms_are_projected_together(monkeypatch, known):
     given = [effect_of(n, SCAN) for n in ("irf_tail", "power_drift", "time_offset", "gate_edges")]
     truth = columns(given[1]) @ (2 * TRUTH) + normal(ROWS, seed=11)
     together = screen(problem(truth), given, BLOCK)
-    monkeypatch.setattr(pool, "TOGETHER", 1)
+    monkeypatch.setattr(screening, "TOGETHER", 1)
     apart = screen(problem(truth), given, BLOCK)
     assert together[0].name == "power_drift"
     assert [c.evidence for c in together] == sorted((c.evidence for c in together), reverse=True)
@@ -669,7 +671,7 @@ def test_what_is_the_same_in_such_a_scan_comes_never_beside_it(alike, monkeypatc
 def asked_beside(name: str, scan: Scan, monkeypatch, only: list[str] | None = None) -> list[str]:
     """Names of what is asked for beside a fit that has one effect."""
     names = list[str]()
-    monkeypatch.setattr(pool, "_problem", lambda *_: (None, BLOCK))
+    monkeypatch.setattr(pool, "problem_of", lambda *_: (None, BLOCK))
     monkeypatch.setattr(pool, "Projector", lambda problem: None)
     monkeypatch.setattr(pool, "together", lambda *_: [])
     monkeypatch.setattr(pool, "screen", lambda p, effects, *_: names.extend(e.name for e in effects) or [])
@@ -784,12 +786,12 @@ def test_scatter_of_a_spots_own_coefficient_by_hand():
     column = torch.ones(3, 8)
     noise = torch.tensor([1.0, -1.0, 1.0, -1.0])
     residual = (torch.tensor([5.0, 0.0, -2.0])[:, None] + 2 * noise).repeat_interleave(2, 1)
-    assert pool.spot_scatter(column, residual) == pytest.approx(4 * 2 * 4 / 3)
-    assert pool.spot_scatter(column, torch.full((3, 8), 7.0)) == 1
+    assert screening.spot_scatter(column, residual) == pytest.approx(4 * 2 * 4 / 3)
+    assert screening.spot_scatter(column, torch.full((3, 8), 7.0)) == 1
 
 
 def test_scatter_of_a_spots_own_coefficient_is_that_of_counts():
-    assert pool.spot_scatter(normal(400, 30, seed=3).abs(), normal(400, 30, seed=4)) == pytest.approx(
+    assert screening.spot_scatter(normal(400, 30, seed=3).abs(), normal(400, 30, seed=4)) == pytest.approx(
         1, abs=0.1
     )
 

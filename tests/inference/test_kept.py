@@ -22,10 +22,11 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE
 from nlos_lit.effects.smooth import SeveralWidths
+from nlos_lit.inference.candidates import Pool, Taken
 from nlos_lit.inference.kept import kinds
-from nlos_lit.inference.pool import Pool, Taken, screen
 from nlos_lit.inference.problem import build_problem
 from nlos_lit.inference.scenes import begun_with
+from nlos_lit.inference.screening import screen
 from nlos_lit.runtime.plain_file import read_plain, write_plain
 from nlos_lit.surfels.fit import SurfelFit
 

@@ -20,11 +20,11 @@ from nlos_lit.effects.free_terms import FREE, FREE_NAMES
 from nlos_lit.inference import asking, beginning, members, scenes
 from nlos_lit.inference.asking import Asking, misfit_of
 from nlos_lit.inference.beginning import begun
+from nlos_lit.inference.candidates import Candidate, Pool, Taken, foreign
 from nlos_lit.inference.criticise import criticise, unsaid
 from nlos_lit.inference.heldout import Comparison, compare
 from nlos_lit.inference.holding import Holding
 from nlos_lit.inference.members import Confirmed, Findings, Held, Member, Trial, chosen, group_of, weighed
-from nlos_lit.inference.pool import Candidate, Pool, Taken, foreign
 from nlos_lit.inference.scenes import Scenes, begun_with, copy_effects
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.runtime.steps import Steps

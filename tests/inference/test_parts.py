@@ -18,9 +18,9 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference import toys
 from nlos_lit.inference.base_pipeline import BasePipeline
+from nlos_lit.inference.candidates import Pool
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.per_spot import neighbours
-from nlos_lit.inference.pool import Pool
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
