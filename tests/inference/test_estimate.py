@@ -17,6 +17,7 @@ from torch import Tensor
 from nlos_lit.capture.scan import Scan
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
+from nlos_lit.inference import tested
 from nlos_lit.inference.advise import plans
 from nlos_lit.inference.assemble import _screened, assemble, shape_of, visible_score
 from nlos_lit.inference.candidates import Candidate, Pool
@@ -34,7 +35,6 @@ from nlos_lit.inference.residuals import SIDE
 from nlos_lit.inference.result import Likely
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import split_spots
-from nlos_lit.inference.tested import tested_rows
 from nlos_lit.inference.toys import Null
 from nlos_lit.inference.uncertainty import UNLIKE, Uncertainty
 from nlos_lit.surfels.fit import SurfelFit
@@ -370,7 +370,7 @@ def test_own_evidence_is_that_of_the_term_left_out(findings):
     names = ["irf_tail", "free_wall"]
     asked, _ = own_evidence(fit, split, 48, 3, names, lambda lit, lost: lit)
     assert own_evidence(fit, split, 48, 3, names, lambda lit, lost: -math.inf)[1] == names
-    rows = tested_rows(fit, split, 48, 3)
+    rows = tested.tested_rows(fit, split, 48, 3)
     spots, block = torch.from_numpy(split.fit[rows]), torch.from_numpy(split.block[split.fit[rows]])
     for effect in fit.extension.effects:
         problem = build_problem(fit.model, fit.extension, spots, fit.counts[rows], without=effect)

@@ -547,13 +547,13 @@ def test_many_shapes_are_ranked_before_they_are_projected(monkeypatch):
     """Of all periods only the 16 most promising are projected; the right one is among them."""
     stand_in(monkeypatch, lambda problem, effect, *_: ripple(float(effect.value("period").detach())))
     grid = RIPPLE.shape_grid()
-    assert len(grid) > 2 * pool.KEPT
+    assert len(grid) > 2 * screening.KEPT
     period = grid[29]["period"]
     passes, free = [], Projector.free
     monkeypatch.setattr(Projector, "free", lambda self, z: passes.append(z.shape[1]) or free(self, z))
     found = look("ripple", ripple(period) @ torch.tensor([5.0, -3.0]) + normal(ROWS, seed=7))
     # Unevenness, the residual, then all columns at once, and those on both sides of the best, thrice.
-    assert passes == [0, 1, 2 * pool.KEPT, 4, 4, 4]
+    assert passes == [0, 1, 2 * screening.KEPT, 4, 4, 4]
     assert found.shape["period"] == period
 
 
@@ -571,7 +571,7 @@ def test_shapes_between_those_of_the_grid_are_tried_where_a_term_is_strong_enoug
     for strength in (0.5, 0.1, 0.03):
         loud = look("ripple", strength * truth + noise)
         on_grid = min(abs(loud.shape["period"] - p) for p in grid) < 1e-6
-        assert on_grid == (loud.loud - math.log(len(grid)) < pool.CLOSER)
+        assert on_grid == (loud.loud - math.log(len(grid)) < screening.CLOSER)
     monkeypatch.setattr(screening, "HALVINGS", 0)
     coarse = look("ripple", truth + noise)
     assert coarse.shape["period"] == grid[4]

@@ -15,11 +15,11 @@ from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.free_terms import FREE, FREE_NAMES, TAILS, tails_of, time_bands
 from nlos_lit.effects.scan_pieces import bands
+from nlos_lit.inference import tested
 from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.evidence import by_width, prior_deviations
 from nlos_lit.inference.problem import build_problem
 from nlos_lit.inference.screening import screen
-from nlos_lit.inference.tested import tested_rows
 
 SIDE = 16
 SCENE = capture_of(raster(SIDE))
@@ -338,14 +338,14 @@ def test_rows_are_a_fixed_choice_of_the_fitted_ones():
     class Split:
         fit = np.arange(100, 200)
 
-    rows = tested_rows(None, Split, 30, seed=3)
+    rows = tested.tested_rows(None, Split, 30, seed=3)
     assert np.array_equal(rows, np.unique(rows))
     assert len(rows) == 30
     assert rows[0] >= 0
     assert rows[-1] < 100
-    assert np.array_equal(rows, tested_rows(None, Split, 30, seed=3))
-    assert not np.array_equal(rows, tested_rows(None, Split, 30, seed=4))
-    assert np.array_equal(tested_rows(None, Split, 1000, seed=3), np.arange(100))
+    assert np.array_equal(rows, tested.tested_rows(None, Split, 30, seed=3))
+    assert not np.array_equal(rows, tested.tested_rows(None, Split, 30, seed=4))
+    assert np.array_equal(tested.tested_rows(None, Split, 1000, seed=3), np.arange(100))
 
 
 def test_a_changed_response_is_differentiated_where_it_is():
