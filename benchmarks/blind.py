@@ -332,10 +332,15 @@ def looks_of(cases: list[dict]) -> dict[str, list[dict]]:
     return dict(reversed(by.items()))
 
 
+def span(rows: list[dict]) -> str:
+    """Numbers of the first capture and the last."""
+    numbers = [row["index"] for row in rows]
+    return f"{min(numbers)} – {max(numbers)}"
+
+
 def side_by_side(looks: dict[str, list[dict]]) -> str:
     """All looks as Markdown: what was measured in a line each, a look a column, without intervals."""
-    spans = [f"{min(c['index'] for c in rows)} – {max(c['index'] for c in rows)}" for rows in looks.values()]
-    out = ["| what | " + " | ".join(spans) + " |", "|---" * (len(looks) + 1) + "|"]
+    out = ["| what | " + " | ".join(map(span, looks.values())) + " |", "|---" * (len(looks) + 1) + "|"]
     columns = [[value.split(" =")[0] for _, _, value in rows_of(rows)] for rows in looks.values()]
     whats = [what for what, _, _ in rows_of([])]
     out += [f"| {what} | " + " | ".join(line) + " |" for what, *line in zip(whats, *columns, strict=True)]
@@ -367,13 +372,12 @@ def report() -> None:
     )
     looks = looks_of(validation)
     last = [case for rows in list(looks.values())[:LAST] for case in rows]
-    first, end = (choose(c["index"] for c in last) for choose in (min, max))
     rewrite(
         "blind.md",
         [
             test_set(test),
             f"## The last {LAST} looks at the validation set, together\n\n"
-            f"Captures {first} – {end}, each look by another state of the program, all older than the\n"
+            f"Captures {span(last)}, each look by another state of the program, all older than the\n"
             f"frozen rules.\n\n{rates(last)}\n",
         ],
     )

@@ -58,7 +58,7 @@ class Search:
     def __init__(self, base: SurfelFit, scenes: Scenes, scan: Scan, s: CriticismSettings, told: Told) -> None:
         self.scenes, self.settings, self.told = scenes, s, told
         self.asking = Asking(scenes, scan, s)
-        self.holding = Holding(scenes, self.asking, s)
+        self.holding = Holding(self.asking)
         self.least = self.asking.least
         self._begin_with(base, scenes.fine(base, "without_effects"))
 

@@ -21,8 +21,6 @@ from nlos_lit.inference.members import (
     unknown_beside,
     weighed,
 )
-from nlos_lit.inference.scenes import Scenes
-from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.surfels.fit import SurfelFit
 
 Built = tuple[SurfelFit, SurfelFit | None]  # a parsimonious scene, and the fine one, where it was made
@@ -43,13 +41,11 @@ class Holding:
     """Asks whether terms of a scene hold.
 
     Args:
-        scenes: of the capture.
-        asking: of its counts.
-        settings: of the criticism.
+        asking: of the counts of a capture, beside its scenes.
     """
 
-    def __init__(self, scenes: Scenes, asking: Asking, settings: CriticismSettings) -> None:
-        self.scenes, self.asking, self.settings = scenes, asking, settings
+    def __init__(self, asking: Asking) -> None:
+        self.asking, self.scenes, self.settings = asking, asking.scenes, asking.settings
 
     def hold(
         self,

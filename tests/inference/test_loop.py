@@ -170,8 +170,7 @@ class World:
         return Asking(self.scenes(), SCAN, SETTINGS)
 
     def holding(self) -> Holding:
-        asked = self.asking()
-        return Holding(asked.scenes, asked, SETTINGS)
+        return Holding(self.asking())
 
     def begun(self, base: FakeFit, pool: Pool) -> Held:
         return begun(self.scenes(), base, fitted(fine=True), pool, LEAST)
