@@ -10,12 +10,14 @@ import math
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
 from conftest import ROOT
 
 sys.path.append(str(ROOT / "benchmarks"))
 
+import p_values
 import ratio
 import report
 from literal_torch import LiteralIteration
@@ -220,3 +222,14 @@ def test_reports(tmp_path, monkeypatch):
     report.PAGE.write_text("before\n<!-- one -->\nold\n<!-- /one -->\nafter\n")
     report.write_section("one", "new")
     assert report.PAGE.read_text() == "before\n<!-- one -->\n\nnew\n\n<!-- /one -->\nafter\n"
+
+
+def test_chances_are_held_against_uniform_ones():
+    """One of each chance is uniform; twenty of the least are 19 of 20 steps away, ten even ones one."""
+    even = [k / 20 for k in range(1, 21)]
+    assert p_values.summary(even) == {"captures": 20, "distance": 0, "as_far_by_chance": 1}
+    least = p_values.summary([0.05] * 20)
+    assert (least["distance"], least["as_far_by_chance"]) == (0.95, 0)
+    assert p_values.distance(np.array([k / 10 for k in range(1, 11)])) == pytest.approx(0.05)
+    # Of two, both at 1/20 come once in 400 draws, and both at 1, as far away, as rarely.
+    assert p_values.summary([0.05, 0.05])["as_far_by_chance"] == pytest.approx(2 / 400, rel=0.2)

@@ -22,7 +22,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.foreign import bounded
 from nlos_lit.capture.scan import Scan
-from nlos_lit.inference.pool import ask
+from nlos_lit.inference.pool import ask, lit_by
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.split import Split
 from nlos_lit.runtime.steps import Report
@@ -143,7 +143,7 @@ def _toy(
 ) -> None:
     torch.set_num_threads(1)
     fit = pipeline(capture, split, seed)
-    pool = ask(fit, split, Scan.of(capture), settings.spots, seed).candidates
+    pool = ask(fit, split, lit_by(fit, Scan.of(capture)), settings.spots, seed).candidates
     part = store / f".toy_{seed}.json"
     part.write_text(json.dumps({"largest": pool[0].evidence, "term": pool[0].name}))
     part.rename(store / f"toy_{seed}.json")

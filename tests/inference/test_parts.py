@@ -21,6 +21,7 @@ from nlos_lit.inference.base_pipeline import BasePipeline
 from nlos_lit.inference.candidates import Pool
 from nlos_lit.inference.diagnose import diagnose
 from nlos_lit.inference.per_spot import neighbours
+from nlos_lit.inference.pool import lit_by
 from nlos_lit.inference.residuals import SIDE, profiles
 from nlos_lit.inference.settings import CriticismSettings
 from nlos_lit.inference.toys import Null, read_toys, run_toys, toy_capture
@@ -73,7 +74,7 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
     asked = []
 
     def ask(fit, split, scan, most, seed):
-        asked.append((most, seed))
+        asked.append((most, seed, np.array_equal(scan.light, lit_by(fit, scan).light)))
         return Pool([candidate("irf_tail", 3.0 + seed), candidate("hum", 1.0)], [])
 
     monkeypatch.setattr(toys, "ask", ask)
@@ -91,7 +92,9 @@ def test_interrupted_toys_go_on(tmp_path, monkeypatch):
     assert seeds == [(k, int(toy_capture(scene, fit, k).counts.sum())) for k in (0, 2)]
     assert [text for text, *_ in said] == ["toy 2 of 3", "toy 3 of 3"]
     assert said[0][2] > said[1][2] == 0  # one to go, then none
-    assert asked == [(settings.spots, 0), (settings.spots, 2)]
+    assert asked == [(settings.spots, 0, True), (settings.spots, 2, True)], (
+        "by the fit's light, as captures are"
+    )
     assert null == Null([3.0, 7.0, 5.0])
     assert json.loads((tmp_path / "toy_2.json").read_text()) == {"largest": 5.0, "term": "irf_tail"}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["toy_0.json", "toy_1.json", "toy_2.json"]
