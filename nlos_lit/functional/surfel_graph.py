@@ -16,7 +16,8 @@ NEAR = 1.2  # cells at which the weight of a neighbour in a plane has fallen to 
 RIDGE = 0.3  # of a cell's square: two of the next neighbours outweigh a present normal by far, none do not
 AVERAGES = 6  # over neighbours, by which a shift is carried along a sheet
 STIFFNESS = 0.3  # how much a turn of the normals costs beside a step of the places
-BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat
+BEND = 0.05  # rad, misfit at which neighbours on a sheet cost half a nat, at most
+FLATTEST = 0.002  # rad, misfit that no sheet is held to fall below
 EDGE = 0.3  # of the scene's level: differences of albedo beyond it are edges, and cost little more
 ALIKE = 0.05  # … below it are none, and cost next to nothing
 LEVEL = 0.75  # of the light comes from surfels no brighter than the scene's own level
@@ -336,17 +337,50 @@ def misfits(centre: Tensor, normal: Tensor, pairs: tuple[Tensor, Tensor]) -> Ten
     return out + STIFFNESS * (half**2).sum(1)
 
 
-def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor]) -> Tensor:
-    """Cost of misfits between neighbours: ``½ Σ w_i w_j ln(1 + r²/BEND²)`` over directed pairs.
+def bend_of(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor]) -> float:
+    """How much neighbours misfit: the median r, for which a Cauchy density makes them likeliest.
 
-    It is the negative logarithm of a Cauchy density: a surface of unknown roughness, so that a smooth sheet
-    is stiff and an edge costs a few nats only (r² from :func:`misfits`).
+    Flat boards misfit by a few thousandths, round bodies by as much as their normals turn within a cell.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit.
+        weight: ``[M]`` trust in each surfel; a pair counts their product.
+        pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
+
+    Returns:
+        rad, from ``FLATTEST`` to ``BEND``, which it is where there are no pairs.
+
+    Examples:
+        >>> import torch
+        >>> centre = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [0.2, 0.0, 1.002]])
+        >>> flat = torch.tensor([0.0, 0.0, -1.0]).expand(3, 3)
+        >>> pairs = torch.tensor([1, 2, 0]), torch.tensor([2, 1, 1])  # two of three are of a step of 1 : 50
+        >>> round(bend_of(centre, flat, torch.ones(3), pairs), 3)
+        0.02
+    """
+    i, j = pairs
+    if not len(i):
+        return BEND
+    ordered, of = misfits(centre, normal, pairs).sqrt().sort()
+    told = (weight[i] * weight[j])[of].double().cumsum(0)
+    return min(max(float(ordered[(told < told[-1] / 2).sum()]), FLATTEST), BEND)
+
+
+def bending(
+    centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor, Tensor], bend: float
+) -> Tensor:
+    """Cost of misfits between neighbours: ``½ Σ w_i w_j ln(1 + r²/bend²)`` over directed pairs.
+
+    It is the negative logarithm of a Cauchy density: a surface as rough as it is, so that a smooth sheet is
+    stiff and an edge costs a few nats only (r² from :func:`misfits`).
 
     Args:
         centre: ``[M, 3]`` m.
         normal: ``[M, 3]`` unit.
         weight: ``[M]`` trust in each surfel, a constant; a pair counts their product.
         pairs: i and j ``[P]`` from :func:`neighbour_pairs`.
+        bend: rad at which a pair costs half a nat.
 
     Returns:
         A scalar, differentiable in places and normals.
@@ -356,16 +390,16 @@ def bending(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
         >>> centre = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])
         >>> flat = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3)
         >>> pairs = torch.tensor([0, 1]), torch.tensor([1, 0])
-        >>> bending(centre, flat, torch.ones(2), pairs)
+        >>> bending(centre, flat, torch.ones(2), pairs, BEND)
         tensor(0.)
     """
     if compiled(centre):
         given = (numpy_of(x) for x in (*pairs, centre, normal, weight))
-        cost, *gradients = sheet_loops.bending(*given, BEND, STIFFNESS)
+        cost, *gradients = sheet_loops.bending(*given, bend, STIFFNESS)
         return _Known.apply(cost, tuple(torch.from_numpy(g) for g in gradients), centre, normal)
     i, j = pairs
     trust = weight.index_select(0, i) * weight.index_select(0, j)
-    return (trust * torch.log1p(misfits(centre, normal, pairs) / BEND**2)).sum() / 2
+    return (trust * torch.log1p(misfits(centre, normal, pairs) / bend**2)).sum() / 2
 
 
 def level_of(albedo: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import NOTHING, Hooks
-from nlos_lit.functional.surfel_graph import Sheet
+from nlos_lit.functional.surfel_graph import BEND, Sheet
 from nlos_lit.metrics.transients import Scores, transient_scores
 from nlos_lit.surfels.effect_start import choose_shapes
 from nlos_lit.surfels.growth import PlaceTest, Seeds, begin_bodies, prune_and_grow
@@ -36,6 +36,7 @@ PLAIN = (
     "undo",
     "finer",
     "priced",
+    "bend",
     "history",
     "losses",
 )
@@ -238,6 +239,7 @@ class SurfelFit:
         self.undo: dict[str, Any] | None = None  # what that began with
         self.priced = True  # no round was judged yet: surfels cost something
         self.finer = True  # surfels may be divided before one of them
+        self.bend = BEND  # rad, by how much neighbours are taken to misfit
         self.history: list[dict[str, float]] = []
         self.losses: list[float] = []
         self.optimizer: torch.optim.Optimizer | None = None
@@ -462,6 +464,8 @@ class SurfelFit:
         if not now.onward:
             self._arrange(now)
         self.model.lay(as_it_is=now.onward)
+        if self._outlined:  # sheets are found: flat ones are stiff from here on
+            self.bend = self.model.bend()
         self.optimizer = self._new_optimizer()
 
     def _arrange(self, now: Round) -> None:
@@ -566,7 +570,7 @@ class SurfelFit:
         expected = model.render(self.train[rows], self.extension, model.leaning(laid)).clamp_min(1e-12)
         terms = {
             "counts": (expected - torch.xlogy(self.counts[rows], expected)).mean(),
-            "bending": s.bending * per_count * model.bending(laid),
+            "bending": s.bending * per_count * model.bending(laid, self.bend),
             "albedos": per_count * model.albedo_cost(*self._albedo_weights()),
             "effects": per_count * torch.as_tensor(self.extension.penalty()),
         }

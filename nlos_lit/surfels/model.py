@@ -15,6 +15,7 @@ from nlos_lit.functional.irf import convolve_time
 from nlos_lit.functional.surfel_graph import (
     Sheet,
     albedo_cost,
+    bend_of,
     bending,
     carry_along,
     curvature_of,
@@ -278,16 +279,22 @@ class SurfelModel(nn.Module):
         albedo = self.albedo().detach()
         return albedo / (albedo + 0.3 * albedo.mean())
 
-    def bending(self, laid: tuple[Tensor, Tensor]) -> Tensor:
+    @torch.no_grad()
+    def bend(self) -> float:
+        """How much neighbours misfit, see :func:`~nlos_lit.functional.surfel_graph.bend_of`."""
+        return bend_of(*self.laid(), self.trust(), self.pairs)
+
+    def bending(self, laid: tuple[Tensor, Tensor], bend: float) -> Tensor:
         """How badly neighbours fit one surface, see :func:`~nlos_lit.functional.surfel_graph.bending`.
 
         Args:
             laid: from :meth:`laid`: how rims roll off is one number, and no bend of each.
+            bend: rad, of :meth:`bend` as it was when the sheet was laid.
 
         Returns:
             A scalar, differentiable.
         """
-        return bending(*laid, self.trust(), self.pairs)
+        return bending(*laid, self.trust(), self.pairs, bend)
 
     def albedo_cost(
         self, evenness: float, bright: float, there: float, albedo: Tensor | None = None

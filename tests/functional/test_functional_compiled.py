@@ -180,7 +180,7 @@ def test_costs(plainly):
     pairs, weight = neighbour_pairs(centre, normal, 0.1), torch.rand(200, generator=GEN)
 
     def bends(centre: Tensor, normal: Tensor) -> Tensor:
-        return bending(centre, normal, weight, pairs)
+        return bending(centre, normal, weight, pairs, 0.03)
 
     assert alike(with_gradients(bends, centre, normal), plainly(with_gradients, bends, centre, normal))
     albedo = torch.rand(200, generator=GEN) ** 3

@@ -14,6 +14,7 @@ from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of,
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
+from nlos_lit.functional.surfel_graph import BEND
 from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, plan_from_seeds
 from nlos_lit.surfels.growth import Seeds
 
@@ -58,16 +59,19 @@ def same(first: object, second: object) -> bool:
 
 
 def test_a_fit_that_is_stopped_after_every_call_ends_where_the_other_does(tmp_path):
-    straight, stopped, moments, tried = begun(), begun(), 0, []
+    straight, stopped, moments, tried, bends = begun(), begun(), 0, [], []
     while not straight.finished:
         straight.begin_round()
         tried.append(straight.state()["undo"])
+        bends.append(straight.bend)
         while not straight.round_done:
             straight.step()
         straight.end_round()
     assert straight.history[0]["surfels"] <= 12
     assert len(straight.history) > 4  # rounds were added
     assert any(each is not None for each in tried), "no round could have been undone"
+    assert bends[:3] == [BEND] * 3
+    assert max(bends[3:]) < BEND, "flat sheets are stiff once they are found"
     while not stopped.finished:
         stopped = through_a_file(stopped, tmp_path / "state.pt")
         if not stopped.in_round:

@@ -17,8 +17,10 @@ from nlos_lit.functional.surfel_graph import (
     ALIKE,
     BEND,
     EDGE,
+    FLATTEST,
     STIFFNESS,
     albedo_steps,
+    bend_of,
     bending,
     misfits,
     neighbour_pairs,
@@ -336,14 +338,32 @@ def test_bending_vanishes_on_a_sphere_and_punishes_turned_normals():
     half = (normal[i] - normal[j]) / 2  # what is left on an arc is the turn itself
     assert torch.allclose(misfits(centre, normal, pairs), STIFFNESS * (half**2).sum(1), atol=1e-9)
     turned = torch.nn.functional.normalize(normal + torch.tensor([0.2, 0.0, 0.0]), dim=1)
-    assert bending(centre, turned, weight, pairs) > 4 * bending(centre, normal, weight, pairs)
-    # By hand: a pair whose misfit is BEND costs ln 2 in the two directions together.
+    assert bending(centre, turned, weight, pairs, BEND) > 4 * bending(centre, normal, weight, pairs, BEND)
+    # By hand: a pair whose misfit is `bend` costs ln 2 in the two directions together.
     flat = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0]])
-    rise = BEND / (1 - BEND**2) ** 0.5
+    rise = 0.03 / (1 - 0.03**2) ** 0.5
     flat[1, 2] += 0.1 * rise
     facing = torch.tensor([0.0, 0.0, -1.0]).expand(2, 3)
     both = torch.tensor([0, 1]), torch.tensor([1, 0])
-    assert bending(flat, facing, torch.ones(2), both).item() == pytest.approx(np.log(2), rel=1e-4)
+    assert bending(flat, facing, torch.ones(2), both, 0.03).item() == pytest.approx(np.log(2), rel=1e-4)
+
+
+def test_how_much_neighbours_misfit():
+    """Steps of 0.003, 0.02 and 0.02 in a row: 0.02 by most; dark surfels do not count; held at both ends."""
+    facing = torch.tensor([0.0, 0.0, -1.0]).expand(4, 3)
+    pairs = torch.tensor([0, 1, 2, 1, 2, 3]), torch.tensor([1, 2, 3, 0, 1, 2])
+
+    def bend(steps: list[float], weight: list[float]) -> float:
+        height = 0.1 * torch.tensor([0.0, *steps]).cumsum(0)
+        centre = torch.stack([0.1 * torch.arange(4.0), torch.zeros(4), 1 + height], 1)
+        return bend_of(centre, facing, torch.tensor(weight), pairs)
+
+    assert bend([0.003, 0.02, 0.02], [1.0, 1.0, 1.0, 1.0]) == pytest.approx(0.02, rel=1e-3)
+    assert bend([0.003, 0.02, 0.02], [1.0, 1.0, 0.1, 0.1]) == pytest.approx(0.003, rel=1e-3)
+    assert bend([0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]) == FLATTEST
+    assert bend([0.2, 0.3, 0.2], [1.0, 1.0, 1.0, 1.0]) == BEND
+    none = torch.zeros(0, dtype=torch.long)
+    assert bend_of(torch.ones(1, 3), facing[:1], torch.ones(1), (none, none)) == BEND
 
 
 def test_an_edge_of_albedo_costs_little_more_the_higher_it_is():
