@@ -41,6 +41,7 @@ PLAIN = (
     "losses",
 )
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
+AGAIN = 25  # batches after which it is asked again how rough sheets are
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -464,9 +465,13 @@ class SurfelFit:
         if not now.onward:
             self._arrange(now)
         self.model.lay(as_it_is=now.onward)
-        if self._outlined:  # sheets are found: flat ones are stiff from here on
-            self.bend = self.model.bend()
+        self._roughen()
         self.optimizer = self._new_optimizer()
+
+    def _roughen(self) -> None:
+        """Once sheets are found they are held to be as rough as they are."""
+        if self._outlined:
+            self.bend = self.model.bend()
 
     def _arrange(self, now: Round) -> None:
         """Neighbours, shapes, death and growth, outlines, who hides whom."""
@@ -591,7 +596,7 @@ class SurfelFit:
         self.stepped(terms)
 
     def stepped(self, terms: dict[str, Tensor]) -> None:
-        """Count a batch whose gradient step has been taken: bounds, rates.
+        """Count a batch whose gradient step has been taken: bounds, rates, how rough sheets are.
 
         Args:
             terms: of the batch, as :meth:`loss` gave them.
@@ -601,6 +606,8 @@ class SurfelFit:
         self.losses.append(float(terms["counts"].detach()))
         self.done += 1
         self._set_rates(self.optimizer)
+        if len(self.losses) % AGAIN == 0:
+            self._roughen()
 
     def end_round(self) -> None:
         """Note the round, and see whether another follows."""
