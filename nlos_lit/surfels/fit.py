@@ -305,8 +305,14 @@ class SurfelFit:
         Surfels are other objects from then on, effects keep theirs.
 
         Raises:
-            UserError: it is the state of a fit with other effects.
+            UserError: it is the state of a fit with other effects, or of another version's.
         """
+        lacking = [name for name in PLAIN if name not in state]
+        if lacking:
+            raise UserError(
+                f"the kept surface fit was left by another version of this project (it lacks {lacking[0]}); "
+                "begin anew"
+            )
         own, kept = self.extension.state_dict().keys(), state["extension"].keys()
         if own != kept:
             raise UserError(

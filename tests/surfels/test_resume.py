@@ -11,6 +11,7 @@ import pytest
 import torch
 from inference_scenes import FORWARD_MODE, capture_of, drawn, effect_of, fit_of, raster, surfels
 
+from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
@@ -118,6 +119,14 @@ def test_a_state_is_a_copy():
     other.restore(kept)
     other.finish()
     assert same(kept, before)
+
+
+def test_a_fit_of_another_version_is_refused():
+    fit = begun()
+    kept = fit.state()
+    del kept["bend"]
+    with pytest.raises(UserError, match=r"another version of this project \(it lacks bend\); begin anew"):
+        begun().restore(kept)
 
 
 def test_rates_fall_within_a_round_and_the_last_cools_down():
