@@ -225,11 +225,11 @@ def test_reports(tmp_path, monkeypatch):
 
 
 def test_chances_are_held_against_uniform_ones():
-    """One of each chance is uniform; twenty of the least are 19 of 20 steps away, ten even ones one."""
-    even = [k / 20 for k in range(1, 21)]
-    assert p_values.summary(even) == {"captures": 20, "distance": 0, "as_far_by_chance": 1}
-    least = p_values.summary([0.05] * 20)
-    assert (least["distance"], least["as_far_by_chance"]) == (0.95, 0)
-    assert p_values.distance(np.array([k / 10 for k in range(1, 11)])) == pytest.approx(0.05)
-    # Of two, both at 1/20 come once in 400 draws, and both at 1, as far away, as rarely.
-    assert p_values.summary([0.05, 0.05])["as_far_by_chance"] == pytest.approx(2 / 400, rel=0.2)
+    """One of each chance is uniform; twenty of the least are 9 of 10 steps away, five even ones one."""
+    even = [k / 10 for k in range(1, 11)]
+    assert p_values.summary(even) == {"captures": 10, "distance": 0, "as_far_by_chance": 1}
+    least = p_values.summary([0.1] * 20)
+    assert (least["distance"], least["as_far_by_chance"]) == (0.9, 0)
+    assert p_values.distance(np.array([k / 5 for k in range(1, 6)])) == pytest.approx(0.1)
+    # Of two, both at 1/10 come once in 100 draws, and both at 1, as far away, as rarely.
+    assert p_values.summary([0.1, 0.1])["as_far_by_chance"] == pytest.approx(2 / 100, rel=0.1)
