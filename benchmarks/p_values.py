@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -22,8 +21,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks"), str(ROOT / "tests" / "blind")]
 STORE = ROOT / "benchmarks" / "results" / "p_values"
-TOYS = 9
-DRAWS = 100_000
+TOYS = 9  # captures drawn from each fit: chances are tenths
+DRAWS = 100_000  # of as many uniform chances as there are captures
 TABLE = "chances where nothing is hidden"
 
 
@@ -31,9 +30,8 @@ def row_of(number: int) -> dict:
     """One validation capture's row."""
     from blind import commit
     from blind_judge import pipeline_for
-    from wild_truth import make
+    from judge_wild import hidden
 
-    from data_modules.readers import read_capture
     from nlos_lit.capture.scan import Scan
     from nlos_lit.inference.pool import ask, lit_by
     from nlos_lit.inference.settings import CriticismSettings
@@ -41,9 +39,7 @@ def row_of(number: int) -> dict:
     from nlos_lit.inference.toys import run_toys
 
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as folder:
-        truth = make("validation", number, Path(folder) / "capture.hdf5")
-        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    truth, capture = hidden("validation", number)
     pipeline, split, settings = pipeline_for(capture), split_spots(capture), CriticismSettings(toys=TOYS)
     base = pipeline(capture, split, 0)
     most = ask(base, split, lit_by(base, Scan.of(capture)), settings.spots, 0).candidates[0]

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -29,10 +28,9 @@ def row_of(number: int) -> dict:
     """One development capture's row."""
     from blind import commit
     from blind_judge import pipeline_for
+    from judge_wild import hidden
     from wild_statistic import true_statistics
-    from wild_truth import make
 
-    from data_modules.readers import read_capture
     from nlos_lit.capture.scan import Scan
     from nlos_lit.effects.extension import Extension
     from nlos_lit.inference.asking import Asking
@@ -44,9 +42,7 @@ def row_of(number: int) -> dict:
     from nlos_lit.runtime.steps import Steps
 
     began = time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        truth = make("development", number, Path(folder) / "capture.hdf5")
-        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    truth, capture = hidden("development", number)
     pipeline, split = pipeline_for(capture), split_spots(capture)
     base = pipeline.fit(capture, split, pipeline.image(capture), Extension([]), 0)
     scan = lit_by(base, Scan.of(capture))

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -96,16 +95,13 @@ def scenes(pipeline, capture, split, elements):
 def report(number: int, from_truth: bool, options: dict[str, str]) -> None:
     """Print one development capture's rows."""
     from blind_judge import pipeline_for
+    from judge_wild import hidden
     from surface import changed
-    from wild_truth import make
 
-    from data_modules.readers import read_capture
     from nlos_lit.inference.heldout import score
     from nlos_lit.inference.split import split_spots
 
-    with tempfile.TemporaryDirectory() as folder:
-        truth = make("development", number, Path(folder) / "capture.hdf5")
-        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    truth, capture = hidden("development", number)
     first, last = capture.gate
     expected = truth.expected[:, first:last] if truth.expected.shape[1] > last - first else truth.expected
     expected = expected.astype(np.float64)

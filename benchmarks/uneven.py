@@ -11,7 +11,6 @@ which is what the pool reckons with (docs/notebook.md).
 from __future__ import annotations
 
 import sys
-import tempfile
 from pathlib import Path
 
 import torch
@@ -78,16 +77,13 @@ def asked(fit, split) -> float:
 def report(index: int) -> None:
     """Print one development capture's rows, of its parsimonious and of its fine scene."""
     from blind_judge import pipeline_for
-    from wild_truth import make
+    from judge_wild import hidden
 
-    from data_modules.readers import read_capture
     from nlos_lit.effects.extension import Extension
     from nlos_lit.inference.problem import patches_of, towards_wall
     from nlos_lit.inference.split import split_spots
 
-    with tempfile.TemporaryDirectory() as folder:
-        truth = make("development", index, Path(folder) / "capture.hdf5")
-        capture = read_capture(Path(folder) / "capture.hdf5", "auto")
+    truth, capture = hidden("development", index)
     spec = truth.spec
     if spec.effects or not truth.scene.own:
         print(f"{index}: skipped, not an effect-free scene of our own")

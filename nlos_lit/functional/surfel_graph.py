@@ -362,9 +362,15 @@ def bend_of(centre: Tensor, normal: Tensor, weight: Tensor, pairs: tuple[Tensor,
     i, j = pairs
     if not len(i):
         return BEND
-    ordered, of = misfits(centre, normal, pairs).sqrt().sort()
-    told = (weight[i] * weight[j])[of].double().cumsum(0)
-    return min(max(float(ordered[(told < told[-1] / 2).sum()]), FLATTEST), BEND)
+    median = _quantile(misfits(centre, normal, pairs).sqrt(), weight[i] * weight[j], 0.5)
+    return min(max(float(median), FLATTEST), BEND)
+
+
+def _quantile(value: Tensor, weight: Tensor, share: float) -> Tensor:
+    """The value up to which a share of the weight comes; both ``[N]``."""
+    ordered, of = value.sort()
+    told = weight[of].double().cumsum(0)
+    return ordered[(told < share * told[-1]).sum()]
 
 
 def bending(
@@ -419,9 +425,8 @@ def level_of(albedo: Tensor) -> Tensor:
         >>> level_of(torch.tensor([0.5, 0.5, 0.5, 0.0, 0.0, 0.0, 0.0])).item()
         0.5
     """
-    ordered = albedo.detach().sort().values
-    light = ordered.double().cumsum(0)
-    return ordered[(light < LEVEL * light[-1]).sum()].clamp_min(1e-7)
+    light = albedo.detach()
+    return _quantile(light, light, LEVEL).clamp_min(1e-7)
 
 
 def albedo_cost(

@@ -289,7 +289,7 @@ class SurfelModel(nn.Module):
 
         Args:
             laid: from :meth:`laid`: how rims roll off is one number, and no bend of each.
-            bend: rad, of :meth:`bend` as it was when the sheet was laid.
+            bend: rad, of :meth:`bend` as it was lately.
 
         Returns:
             A scalar, differentiable.

@@ -72,12 +72,16 @@ class Outcome:
     error: str = ""
 
 
-def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
-    """Hide, diagnose, note what was said."""
+def hidden(set_name: str, index: int) -> tuple[Truth, Capture]:
+    """What is hidden, and the capture as its file is read."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "capture.hdf5"
-        truth = make(set_name, index, path)
-        capture = read_capture(path, "auto")
+        return make(set_name, index, path), read_capture(path, "auto")
+
+
+def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
+    """Hide, diagnose, note what was said."""
+    truth, capture = hidden(set_name, index)
     known = {
         "set_name": set_name,
         "index": index,
@@ -93,7 +97,7 @@ def judge(set_name: str, index: int, options: CriticismSettings) -> Outcome:
     }
     began = time.process_time()
     try:
-        diagnosis, found = diagnose(capture, pipeline_for(capture), options, name=path.stem, seed=0)
+        diagnosis, found = diagnose(capture, pipeline_for(capture), options, name="capture", seed=0)
     except Exception:  # a failure counts against the rates, and the others go on
         return Outcome(**known, error=traceback.format_exc(limit=-2), seconds=time.process_time() - began)
     seconds, right = time.process_time() - began, {n for names in truth.right.values() for n in names}
