@@ -20,6 +20,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
@@ -286,6 +287,13 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     ]
 
 
+def table(heads: Iterable[object], lines: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as Markdown."""
+    heads = list(heads)
+    rows = ("| " + " | ".join(map(str, cells)) + " |" for cells in (heads, *lines))
+    return "\n".join([next(rows), "|---" * len(heads) + "|", *rows])
+
+
 def captures(cases: list[dict]) -> str:
     """One line a capture as Markdown."""
     heads = (
@@ -302,26 +310,24 @@ def captures(cases: list[dict]) -> str:
         "s",
         "commit",
     )
-    out = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
+    lines = []
     for c in sorted(cases, key=lambda c: c["index"]):
         hidden = ", ".join(f"{n} ({s[1]:.0f})" for n, s in c["statistics"].items()) or "nothing"
         said = ", ".join("/".join(group) for group in c["named"]) or ("failed" if c["error"] else "–")
         noise = c["noise"] or float("nan")
-        cells = (
+        lines.append((
             c["index"], c["spec"]["family"], c["spec"]["scan"], f"{c['spec']['level']:g}", hidden, said,
             ", ".join(c.get("likely", ())) or "–", ", ".join(c["unknown"]) or "–",
             f"{c['base'] / noise:.3f}", f"{c['extended'] / noise:.3f}", f"{c['seconds']:.0f}", c["commit"],
-        )  # fmt: skip
-        out.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(out)
+        ))  # fmt: skip
+    return table(heads, lines)
 
 
 def rates(cases: list[dict]) -> str:
     """What was asked for and measured on one look, as Markdown."""
-    out = ["| what | asked for | measured (95 % interval) |", "|---|---|---|"]
-    out += [f"| {what} | {asked} | {value} |" for what, asked, value in rows_of(cases)]
-    seconds = sum(c["seconds"] for c in cases)
-    return "\n".join([*out, "", f"{len(cases)} captures, {seconds / len(cases):.0f} s of a core each."])
+    seconds = sum(c["seconds"] for c in cases) / len(cases)
+    measured = table(("what", "asked for", "measured (95 % interval)"), rows_of(cases))
+    return f"{measured}\n\n{len(cases)} captures, {seconds:.0f} s of a core each."
 
 
 def looks_of(cases: list[dict]) -> dict[str, list[dict]]:
@@ -340,12 +346,58 @@ def span(rows: list[dict]) -> str:
 
 def side_by_side(looks: dict[str, list[dict]]) -> str:
     """All looks as Markdown: what was measured in a line each, a look a column, without intervals."""
-    out = ["| what | " + " | ".join(map(span, looks.values())) + " |", "|---" * (len(looks) + 1) + "|"]
     columns = [[value.split(" =")[0] for _, _, value in rows_of(rows)] for rows in looks.values()]
     whats = [what for what, _, _ in rows_of([])]
-    out += [f"| {what} | " + " | ".join(line) + " |" for what, *line in zip(whats, *columns, strict=True)]
-    out.append("| commit | " + " | ".join(looks) + " |")
-    return "\n".join(out)
+    lines = [*zip(whats, *columns, strict=True), ("commit", *looks)]
+    return table(("what", *map(span, looks.values())), lines)
+
+
+def by_hidden(cases: list[dict]) -> str:
+    """Of each kind of thing that was hidden, alone or in a pair: how often it was named, as Markdown."""
+    from wild_statistic import CLEAR
+
+    by: dict[str, list[tuple[bool, bool, bool, bool]]] = defaultdict(list)
+    for case in cases:
+        said = {name for group in case["named"] for name in group}
+        told, free = said | set(case.get("likely", ())), bool(set(case["unknown"]) & set(case["axes"]))
+        for hidden, right in case["right"].items():
+            named = bool(said & set(right)) if right else free and not said
+            alike = not named and bool(told & {*right, *case["alike"][hidden]})
+            by[hidden].append((case["statistics"][hidden][1] > CLEAR, named, alike, bool(right)))
+    lines = []
+    for hidden, found in sorted(by.items(), key=lambda item: (not item[1][0][3], item[0])):
+        seen = [f for f in found if f[0]]
+        lines.append(
+            (
+                hidden if found[0][3] else f"{hidden} (unknown)",
+                f"{sum(f[1] for f in seen)} of {len(seen)}",
+                f"{sum(f[1] for f in found if not f[0])} of {len(found) - len(seen)}",
+                sum(f[2] for f in found),
+            )
+        )
+    return table(("hidden", "clear ones told of", "fainter ones", "only a look-alike, or as likely"), lines)
+
+
+def by_scene(cases: list[dict]) -> str:
+    """Of each family of scenes: how near a fit comes to the noise, and what is said, as Markdown."""
+    by = defaultdict(list)
+    for case in cases:
+        by[case["spec"]["family"]].append(case)
+    lines = []
+    for family, of_it in sorted(by.items()):
+        null = [c for c in of_it if c["kind"] == "null"]
+        seen = [c for c in of_it if c["kind"] == "single" and clear(c)]
+        over = sorted(c["base"] / c["noise"] for c in null if c["noise"])
+        lines.append(
+            (
+                family,
+                f"{over[len(over) // 2]:.3f} ({over[0]:.3f} … {over[-1]:.3f})" if over else "–",
+                f"{sum(bool(c['named']) for c in null)} of {len(null)}",
+                f"{sum(map(first_right, seen))} of {len(seen)}",
+            )
+        )
+    heads = ("scenes", "misfit over noise of effect-free ones", "false names", "clear ones named first")
+    return table(heads, lines)
 
 
 def test_set(rows: list[dict]) -> str:
@@ -355,7 +407,17 @@ def test_set(rows: list[dict]) -> str:
     head = "## The test set\n\n"
     if {row["index"] for row in rows} != set(range(LENGTH)):
         return f"{head}{len(rows)} of {LENGTH} captures have been run. None has been looked at.\n"
-    return f"{head}{rates(rows)}\n\n{captures(rows)}\n"
+    parts = (
+        rates(rows),
+        "### By what was hidden",
+        "Alone or in a pair. The unknown is told of by a free term along its axis and no name.",
+        by_hidden(rows),
+        "### By scene",
+        by_scene(rows),
+        "### Captures",
+        captures(rows),
+    )
+    return head + "\n\n".join(parts) + "\n"
 
 
 def rewrite(page: str, parts: list[str]) -> None:
