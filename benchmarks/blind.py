@@ -496,10 +496,7 @@ def sensitivity(set_name: str, commit_of: str) -> None:
         "even": (0.0, 0.2, EVEN, 0.8, 0.95),
         "form": (0.0, 0.05, 0.1, now.form, 0.5),
     }
-    print(f"{len(rows)} captures\n")
-    print(
-        "| constant | value | right terms | wrong ones | captures with a wrong one |\n|---|---|---|---|---|"
-    )
+    lines = []
     for name, values in others.items():
         for value in values:
             right = wrong = captures = 0
@@ -507,7 +504,9 @@ def sensitivity(set_name: str, commit_of: str) -> None:
                 true, held = true_names(row), holding(row, **known | {name: value})
                 right, wrong = right + len(held & true), wrong + len(held - true)
                 captures += bool(held - true)
-            print(f"| `{name}` | {value:g} | {right} | {wrong} | {captures} |")
+            lines.append((f"`{name}`", f"{value:g}", right, wrong, captures))
+    heads = ("constant", "value", "right terms", "wrong ones", "captures with a wrong one")
+    print(f"{len(rows)} captures\n\n{table(heads, lines)}")
 
 
 def main(arguments: list[str]) -> None:
