@@ -20,10 +20,11 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from pathlib import Path
+
+from report import table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blind")]
@@ -137,6 +138,17 @@ def likely_right(row: dict) -> bool:
     return bool(set(row.get("likely", ())) & set(row["right"][hidden]))
 
 
+def said(row: dict) -> set[str]:
+    """All names in all groups."""
+    return {name for group in row["named"] for name in group}
+
+
+def told(row: dict, hidden: str) -> bool:
+    """Something hidden stands in some group; of an unknown, nothing does, and its axis has a free term."""
+    right = row["right"][hidden]
+    return bool(said(row) & set(right)) if right else right_axis(row)
+
+
 def true_names(row: dict) -> set[str]:
     """Of what is hidden, and its look-alikes."""
     return {n for names in (*row["right"].values(), *row["alike"].values()) for n in names}
@@ -150,15 +162,19 @@ def wrong_names(row: dict) -> list[str]:
 
 def all_right(row: dict) -> bool:
     """Everything hidden stands in some group."""
-    said = {name for group in row["named"] for name in group}
-    return all(said & set(right) for right in row["right"].values())
+    return all(told(row, hidden) for hidden in row["right"])
+
+
+def shows(row: dict, hidden: str) -> bool:
+    """Something hidden ought to show."""
+    from wild_statistic import CLEAR
+
+    return row["statistics"][hidden][1] > CLEAR
 
 
 def clear(row: dict) -> bool:
-    """Whether every hidden thing ought to show."""
-    from wild_statistic import CLEAR
-
-    return all(projected > CLEAR for _, projected in row["statistics"].values())
+    """Everything hidden ought to show."""
+    return all(shows(row, hidden) for hidden in row["statistics"])
 
 
 def right_axis(row: dict) -> bool:
@@ -181,7 +197,7 @@ def within_two(row: dict) -> list[bool]:
 
 def above_limit(row: dict) -> list[bool]:
     """Of what is stronger than the diagnosis says would be named in nine of ten, whether it is named."""
-    named, found = {name for group in row["named"] for name in group}, []
+    found = []
     for hidden, right in row["right"].items():
         limits = [
             abs(row["values"][hidden][quantity]) > limit
@@ -190,7 +206,7 @@ def above_limit(row: dict) -> list[bool]:
             if quantity in row["values"][hidden]
         ]
         if any(limits):
-            found.append(bool(set(right) & named))
+            found.append(told(row, hidden))
     return found
 
 
@@ -287,13 +303,6 @@ def rows_of(cases: list[dict]) -> list[tuple[str, str, str]]:
     ]
 
 
-def table(heads: Iterable[object], lines: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as Markdown."""
-    heads = list(heads)
-    rows = ("| " + " | ".join(map(str, cells)) + " |" for cells in (heads, *lines))
-    return "\n".join([next(rows), "|---" * len(heads) + "|", *rows])
-
-
 def captures(cases: list[dict]) -> str:
     """One line a capture as Markdown."""
     heads = (
@@ -353,26 +362,26 @@ def side_by_side(looks: dict[str, list[dict]]) -> str:
 
 
 def by_hidden(cases: list[dict]) -> str:
-    """Of each kind of thing that was hidden, alone or in a pair: how often it was named, as Markdown."""
-    from wild_statistic import CLEAR
-
-    by: dict[str, list[tuple[bool, bool, bool, bool]]] = defaultdict(list)
+    """Of each kind of thing that was hidden, alone or in a pair: how often it was told of, as Markdown."""
+    known, unknown = defaultdict(list), defaultdict(list)
     for case in cases:
-        said = {name for group in case["named"] for name in group}
-        told, free = said | set(case.get("likely", ())), bool(set(case["unknown"]) & set(case["axes"]))
         for hidden, right in case["right"].items():
-            named = bool(said & set(right)) if right else free and not said
-            alike = not named and bool(told & {*right, *case["alike"][hidden]})
-            by[hidden].append((case["statistics"][hidden][1] > CLEAR, named, alike, bool(right)))
+            (known if right else unknown)[hidden].append(case)
     lines = []
-    for hidden, found in sorted(by.items(), key=lambda item: (not item[1][0][3], item[0])):
-        seen = [f for f in found if f[0]]
+    for hidden, of_it in sorted(known.items()) + sorted(unknown.items()):
+        seen = [told(c, hidden) for c in of_it if shows(c, hidden)]
+        faint = [told(c, hidden) for c in of_it if not shows(c, hidden)]
+        near = [
+            not told(c, hidden)
+            and bool((said(c) | set(c.get("likely", ()))) & {*c["right"][hidden], *c["alike"][hidden]})
+            for c in of_it
+        ]
         lines.append(
             (
-                hidden if found[0][3] else f"{hidden} (unknown)",
-                f"{sum(f[1] for f in seen)} of {len(seen)}",
-                f"{sum(f[1] for f in found if not f[0])} of {len(found) - len(seen)}",
-                sum(f[2] for f in found),
+                hidden if hidden in known else f"{hidden} (unknown)",
+                f"{sum(seen)} of {len(seen)}",
+                f"{sum(faint)} of {len(faint)}",
+                sum(near),
             )
         )
     return table(("hidden", "clear ones told of", "fainter ones", "only a look-alike, or as likely"), lines)
@@ -396,7 +405,7 @@ def by_scene(cases: list[dict]) -> str:
                 f"{sum(map(first_right, seen))} of {len(seen)}",
             )
         )
-    heads = ("scenes", "misfit over noise of effect-free ones", "false names", "clear ones named first")
+    heads = ("scenes", "effect-free: over noise, median (range)", "false names", "clear ones named first")
     return table(heads, lines)
 
 
