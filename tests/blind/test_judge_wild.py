@@ -22,6 +22,9 @@ import blind
 
 ECHO = {
     "kind": "single",
+    "spec": {"family": "plates"},
+    "base": 1.1,
+    "noise": 1.0,
     "right": {"ghost_echoes": ["ghost_pulse"]},
     "alike": {"ghost_echoes": []},
     "axes": [],
@@ -38,6 +41,7 @@ UNKNOWN = ECHO | {
     "kind": "unknown",
     "right": {"dead_columns": []},
     "alike": {"dead_columns": []},
+    "statistics": {"dead_columns": [300.0, 200.0]},
     "values": {"dead_columns": {"loss": 0.3}},
     "named": [],
     "parameters": {},
@@ -117,6 +121,31 @@ def test_nothing_is_said_of_a_test_set_that_is_not_complete(monkeypatch):
     assert "rates" not in blind.test_set(rows[1:])
     assert "209 of 210 captures have been run" in blind.test_set(rows[1:])
     assert "rates of 210" in blind.test_set(rows)
+
+
+def test_what_is_told_of_by_what_was_hidden():
+    """A faint one is counted apart, and a look-alike alone is none."""
+    faint = ECHO | {"statistics": {"ghost_echoes": [10.0, 8.0]}}
+    alike = ECHO | {"named": [{"irf_tail": 1.0}], "alike": {"ghost_echoes": ["irf_tail"]}}
+    lines = blind.by_hidden([ECHO, faint, alike, UNKNOWN]).splitlines()
+    assert lines[2] == "| ghost_echoes | 1 of 2 | 1 of 1 | 1 |"
+    assert lines[3] == "| dead_columns (unknown) | 1 of 1 | 0 of 0 | 0 |"
+
+
+def test_what_is_said_by_scene():
+    empty = ECHO | {"kind": "null", "right": {}, "named": []}
+    cases = [
+        empty,
+        empty | {"base": 1.3, "named": [{"clock_scale": 1.0}]},
+        empty | {"base": 1.2},
+        ECHO,
+        ECHO | {"named": [], "spec": {"family": "mesh"}},
+    ]
+    lines = blind.by_scene(cases).splitlines()
+    assert lines[2:] == [
+        "| mesh | – | 0 of 0 | 0 of 1 |",
+        "| plates | 1.200 (1.100 … 1.300) | 1 of 3 | 1 of 1 |",
+    ]
 
 
 def test_the_test_set_is_run_by_a_commit_alone(monkeypatch, tmp_path):
