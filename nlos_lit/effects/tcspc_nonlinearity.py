@@ -104,7 +104,8 @@ class TcspcNonlinearity(Effect):
                 waves = waves_at(bins, some[:, None])
                 score = torch.einsum("ptk,t->pk", waves, excess)
                 told = torch.einsum("ptk,t->pk", waves.square(), light)
-                found.append(log_factor(variance * told, variance * score.square(), tried).amax(1))
+                nats = log_factor(variance * told, variance * score.square(), tried).amax(1)
+                found.append(nats.clamp_min(0.0))  # a width of 0 is worth nothing, and no less
             return torch.cat(found)
 
         grid = np.array(self.declared["period"].grid)

@@ -521,6 +521,14 @@ def test_the_shortest_period_goes_before_its_multiples():
     assert {round(shape["period"]) for shape in pattern.likely_in_time(light * wrong, light)} >= {12}
 
 
+def test_a_residual_with_no_noise_has_likely_periods_too():
+    """Of which each is worth nothing: a fit may be as near to the counts as that."""
+    scan = dataclasses.replace(scene("confocal")[1], gate=(10, 310), n_bins=310)
+    light = torch.full((300,), 1e5, dtype=torch.float64)
+    found = effect("tcspc_nonlinearity", scan=scan).likely_in_time(1e-6 * light.sqrt(), light)
+    assert 1 <= len(found) <= 8
+
+
 def test_delays_of_ghosts_are_scanned_densely():
     scan = dataclasses.replace(scene("confocal")[1], n_bins=512)
     bins = np.array(effect("ghost_pulse", scan=scan).declared["delay"].grid) / BIN
