@@ -37,7 +37,7 @@ class AmbientMap(SmoothEffect):
         headline="{rms} rms over the wall",
     )
     coefficients = "level_map"
-    imitated = "light"
+    imitated = ("light",)
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

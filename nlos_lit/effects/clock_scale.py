@@ -28,7 +28,7 @@ class ClockScale(Effect):
     """
 
     name = "clock_scale"
-    imitated = "geometry"
+    imitated = ("geometry",)
     followed_by = ("free_wall_delay",)
     words = EffectWords(
         phrase="a time axis that is stretched",

@@ -49,9 +49,10 @@ class Effect(nn.Module, Hooks):
             over its neighbours counts.
         lasting: it belongs to the wall or to how the rig stands, so that another capture of the same wall has
             it with the same values.
-        imitated: a scene fitted without it imitates it: its "light" by more surfels, as of what real captures
-            have strongly, its "geometry" by places and normals, or its "echoes" by surfels behind the
-            surface. A diagnosis also builds a scene with all effects of each kind from the first surfel on.
+        imitated: kinds of those that a scene fitted without it imitates: its "light" by more surfels, as of
+            what real captures have strongly, its "geometry" by places and normals, its "echoes" or all its
+            "late" light by surfels behind the surface. A diagnosis also builds a scene with all effects of
+            each kind from the first surfel on.
         followed_by: free terms that can do what it does: they take any values where it follows an equation.
         with_power: amplitudes that are proportional to the laser's power.
         hooks: those that the class overrides. What follows from them:
@@ -69,7 +70,7 @@ class Effect(nn.Module, Hooks):
     lasting: ClassVar[bool] = False
     followed_by: ClassVar[tuple[str, ...]] = ()
     with_power: ClassVar[tuple[str, ...]] = ()
-    imitated: ClassVar[Literal["light", "geometry", "echoes"] | None] = None
+    imitated: ClassVar[tuple[Literal["light", "geometry", "echoes", "late"], ...]] = ()
     hooks: ClassVar[frozenset[str]] = frozenset()
     stage: ClassVar[str] = ""
     needs_paths: ClassVar[bool] = False

@@ -36,7 +36,7 @@ class GhostPulse(Effect):
     """
 
     name = "ghost_pulse"
-    imitated = "echoes"
+    imitated = ("echoes",)
     followed_by = ("free_time",)
     words = EffectWords(
         phrase="a second, delayed pulse",

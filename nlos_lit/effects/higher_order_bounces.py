@@ -50,7 +50,7 @@ class HigherOrderBounces(Effect):
     """
 
     name = "higher_order_bounces"
-    imitated = "echoes"
+    imitated = ("echoes",)
     followed_by = ("free_response_wall",)
     words = EffectWords(
         phrase="light that bounced twice inside the hidden scene",

@@ -42,7 +42,7 @@ class IrfTail(Effect):
         headline="{slow} of the photons, τ = {decay}",
     )
     witness = "tail"
-    imitated = "light"
+    imitated = ("light", "late")
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

@@ -29,7 +29,7 @@ class LaserSensorBaseline(Effect):
     """
 
     name = "laser_sensor_baseline"
-    imitated = "geometry"
+    imitated = ("geometry",)
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(

@@ -53,7 +53,7 @@ class Retroreflection(Effect):
     split_by: ClassVar = {
         "wall_reflectance": "the direct pulse's energy over the wall, or a non-confocal scan",
     }
-    imitated = "light"
+    imitated = ("light",)
 
     @classmethod
     def declare(cls, scan: Scan) -> tuple[Parameter, ...]:

@@ -28,7 +28,7 @@ class TimeOffset(Effect):
     """
 
     name = "time_offset"
-    imitated = "geometry"
+    imitated = ("geometry",)
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(

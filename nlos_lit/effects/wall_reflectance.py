@@ -39,7 +39,7 @@ class WallReflectance(SmoothEffect):
     )
     witness = "energy"
     coefficients = "gain_map"
-    imitated = "light"
+    imitated = ("light",)
 
     @classmethod
     def basis(cls, scan: Scan) -> tuple[Tensor, Tensor]:

@@ -41,7 +41,7 @@ class WallScale(Effect):
     """
 
     name = "wall_scale"
-    imitated = "geometry"
+    imitated = ("geometry",)
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(

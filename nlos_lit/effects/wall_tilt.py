@@ -29,7 +29,7 @@ class WallTilt(Effect):
     """
 
     name = "wall_tilt"
-    imitated = "geometry"
+    imitated = ("geometry",)
     followed_by = ("free_wall_delay",)
     lasting = True
     words = EffectWords(

@@ -9,24 +9,27 @@ from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.extension import Extension
 from nlos_lit.inference.candidates import Candidate, Pool
+from nlos_lit.inference.heldout import weights
 from nlos_lit.inference.members import SURE, Held, Member
 from nlos_lit.inference.scenes import Scenes, copy_effects
 from nlos_lit.surfels.fit import SurfelFit
 
 IMITATED = [
-    frozenset(cls.name for cls in EFFECTS if cls.imitated == kind) for kind in ("light", "geometry", "echoes")
+    frozenset(cls.name for cls in EFFECTS if kind in cls.imitated)
+    for kind in ("light", "geometry", "echoes", "late")
 ]
 
 
-def begun(scenes: Scenes, base: SurfelFit, fine: SurfelFit, pool: Pool, least: float) -> Held:
+def begun(scenes: Scenes, base: SurfelFit, fine: SurfelFit, pool: Pool, least: float, odds: float) -> Held:
     """What the search begins with.
 
     Beside a scene that has imitated a strong effect the counts do not ask for that any more. So scenes are
-    also built with all effects of each kind that scenes imitate, from the first surfel on. The best is taken
-    where it surely predicts better than the base, and, when it has become as fine, than the fine scene
-    without any. Where there are no such effects they are a burden, or the scene is a luckier one: where it is
-    as good without them, it is the base. They may also do a little of what is there; so, where they are
-    taken, a scene with what the counts ask for together is built in the same way.
+    also built with all effects of each kind that scenes imitate, from the first surfel on. One is taken where
+    it surely predicts better than the base, and, when it has become as fine, than the fine scene without any:
+    of those that predict nearly as well as the best the one with the fewest effects, since late light may be
+    that of a tail, of echoes or of both. Where there are no such effects they are a burden, or the scene is a
+    luckier one: where it is as good without them, it is the base. They may also do a little of what is there;
+    so, where they are taken, a scene with what the counts ask for together is built in the same way.
 
     Args:
         scenes: of the capture.
@@ -34,6 +37,7 @@ def begun(scenes: Scenes, base: SurfelFit, fine: SurfelFit, pool: Pool, least: f
         fine: the same scene as fine as the counts ask for.
         pool: what the counts ask for beside the base.
         least: nats from which on a term begins with the shapes that the pool found.
+        odds: share of the best one's weight from which on one with fewer effects goes before it.
 
     Returns:
         The effects that are there, if any, and the scenes with them; nobody was asked whether they hold.
@@ -56,8 +60,9 @@ def begun(scenes: Scenes, base: SurfelFit, fine: SurfelFit, pool: Pool, least: f
         grown = scenes.grown(fit, f"begun_with_{'_'.join(names)}")
         if scenes.predicts(grown, fine, SURE):
             found.append(Held(members, grown, fit))
-    best = scenes.better(*(one.coarse for one in found))
-    return next(one for one in found if one.coarse is best)
+    shares = weights([scenes.value(one.coarse) for one in found], scenes.block)
+    near = [k for k, share in enumerate(shares) if share == max(shares) or share >= odds * max(shares)]
+    return found[min(near, key=lambda k: (len(found[k].members), -shares[k]))]
 
 
 def _built(

@@ -117,7 +117,8 @@ class Search:
     def _beginning(self) -> tuple[Held, list[Member]]:
         """What is held when effects are asked for, and those that scenes were built with."""
         start = self.begun
-        self.begun = begun(self.scenes, self.base, self.first, self.pool, self.least)
+        odds = self.settings.odds
+        self.begun = begun(self.scenes, self.base, self.first, self.pool, self.least, odds)
         self.coarse, new = self.begun.coarse, self.begun.members
         if new:
             before, self.pool = self.pool, self._ask(effects=True)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
+from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.inference.asking import Asking
 from nlos_lit.inference.heldout import Comparison, compare, weights
 from nlos_lit.inference.members import (
@@ -24,7 +25,6 @@ from nlos_lit.inference.members import (
 from nlos_lit.surfels.fit import SurfelFit
 
 Built = tuple[SurfelFit, SurfelFit | None]  # a parsimonious scene, and the fine one, where it was made
-HALF = 0.5  # of the misfit: one effect predicts less of what a scene lacks for unknown reasons
 
 
 class Standing(NamedTuple):
@@ -149,9 +149,9 @@ class Holding:
 
         A scene that has bent itself to a term cannot go on without it as well as one that never had it. And
         terms must be asked for as much as they need beside such a scene when it has become fine, but for free
-        ones that hold by what they predict, and numbers of single spots. Not those that account for most of
-        the misfit which this leaves: beside a scene that imitates a strong one, or fails without it, the
-        counts ask for it no more.
+        ones that hold by what they predict, and numbers of single spots. Not effects with which others are
+        predicted better than by this fine scene, but for the chance of a false name: it imitates the term, or
+        fails without it, and then nothing is left of it to be asked for there.
 
         Args:
             members: those that hold are asked.
@@ -187,7 +187,8 @@ class Holding:
         ]
         for name, fine in zip(finer, self.scenes.several(refining, screen=len(finer)), strict=True):
             built[name] = built[name][0], fine
-            if not self._accounts(now[name].evidence, scene, fine):
+            free = name in FREE_NAMES
+            if free or not self.scenes.predicts(scene, fine, 1 - self.settings.level):
                 evidence = self.asking.beside(fine, name, f"{kept}{name}_asked")
                 now[name] = replace(now[name], evidence=min(evidence, now[name].evidence))
         found = [
@@ -208,18 +209,6 @@ class Holding:
         return replace(
             old, gain=least, weight=min(weight, old.weight), explained=min(explained, old.explained)
         )
-
-    def _accounts(self, evidence: float, scene: SurfelFit, fine: SurfelFit) -> bool:
-        """A term of a scene accounts for most of the misfit of a fine one without it.
-
-        Other spots are predicted better with it, which cells that are too wide do not bring about, but for
-        the chance of a false name: by half of that misfit, or its own evidence is more than all of it. What
-        is missing for unknown reasons looks less like one term than that.
-        """
-        before, value = self.scenes.value(fine), self.scenes.value(scene)
-        _, weight, explained = self._gained(fine, before, value)
-        sure = weight > 1 - self.settings.level
-        return sure and (explained > HALF or evidence > self.asking.misfit(fine))
 
     def _gained(self, without: SurfelFit, before: Tensor, value: Tensor) -> tuple[Comparison, float, float]:
         """What select spots gain over a scene without a term, its weight, and the share that it explains.

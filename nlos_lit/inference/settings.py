@@ -20,8 +20,8 @@ class CriticismSettings:
         most: terms that are tried together at most.
         rivals: look-alikes that are tried in the place of each term that holds, at most.
         open_share: weight above which the capture leaves open that a rival is meant.
-        odds: share of the best one's weight from which on a simpler rival goes before it, and effects before
-            something unknown by itself.
+        odds: share of the best one's weight from which on a simpler rival goes before it, a scene begun with
+            fewer effects, and effects before something unknown by itself.
         toys: simulated captures for the null distribution.
         processes: that work on them; fits that go on side by side.
     """
