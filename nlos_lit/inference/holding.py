@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from nlos_lit.effects.free_terms import FREE_NAMES
 from nlos_lit.inference.asking import Asking
 from nlos_lit.inference.heldout import Comparison, compare, weights
 from nlos_lit.inference.members import (
@@ -176,21 +175,21 @@ class Holding:
         built: dict[str, Built] = {m.name: (fit, None) for m, fit in zip(asked, fits, strict=True)}
         now = {m.name: self._missed(m, fit, value) for m, fit in zip(asked, fits, strict=True)}
         finer = [
-            m.name
+            m
             for m in asked
             if now[m.name].holds(m.candidate)
             and not m.candidate.effect.per_spot
             and not (m.candidate.free and now[m.name].much)
         ]
         refining = [
-            self.scenes.refining(built[n][0], f"with_all_of_{'_'.join(names)}_but_{n}") for n in finer
+            self.scenes.refining(built[m.name][0], f"with_all_of_{'_'.join(names)}_but_{m.name}")
+            for m in finer
         ]
-        for name, fine in zip(finer, self.scenes.several(refining, screen=len(finer)), strict=True):
-            built[name] = built[name][0], fine
-            free = name in FREE_NAMES
-            if free or not self.scenes.predicts(scene, fine, 1 - self.settings.level):
-                evidence = self.asking.beside(fine, name, f"{kept}{name}_asked")
-                now[name] = replace(now[name], evidence=min(evidence, now[name].evidence))
+        for m, fine in zip(finer, self.scenes.several(refining, screen=len(finer)), strict=True):
+            built[m.name] = built[m.name][0], fine
+            if m.candidate.free or not self.scenes.predicts(scene, fine, 1 - self.settings.level):
+                evidence = self.asking.beside(fine, m.name, f"{kept}{m.name}_asked")
+                now[m.name] = replace(now[m.name], evidence=min(evidence, now[m.name].evidence))
         found = [
             replace(m, confirmed=now[m.name], accepted=now[m.name].holds(m.candidate)) if m.name in now else m
             for m in members
