@@ -54,7 +54,7 @@ def begun(scenes: Scenes, base: SurfelFit, fine: SurfelFit, pool: Pool, least: f
         if not fit.extension.effects or not scenes.predicts(fit, base, SURE):
             continue
         names = [m.name for m in members]
-        bare = scenes.parted(fit, names, f"begun{kind}_bare")
+        bare = scenes.parted(fit, names, f"begun_{'_'.join(names)}_bare")
         if not scenes.predicts(fit, bare, SURE):
             members, fit = [], bare
         grown = scenes.grown(fit, f"begun_with_{'_'.join(names)}")
@@ -70,10 +70,11 @@ def _built(
 ) -> dict[int, SurfelFit]:
     """Scenes built with the terms of each kind, or the base where no surfel survives with them."""
     jobs = []
-    for kind, members in kinds.items():
+    for members in kinds.values():
         extension = copy_effects(Extension([]), [_at_first(m.candidate, base, least) for m in members])
         text = f"building a scene with {', '.join(e.name for e in extension.effects)}"
-        jobs.append((text, f"begun{kind}", partial(scenes.built_or, base, extension)))
+        kept = f"begun_{'_'.join(m.name for m in members)}"
+        jobs.append((text, kept, partial(scenes.built_or, base, extension)))
     return dict(zip(kinds, scenes.several(jobs), strict=True))
 
 

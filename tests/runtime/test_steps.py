@@ -166,6 +166,8 @@ def test_an_interrupted_diagnosis_ends_like_one_that_was_not(tmp_path, monkeypat
     with pytest.raises(KeyboardInterrupt):
         diagnose(scene, first, options, name="x", seed=0, folder=tmp_path, report=interrupt)
     assert texts[:3] == ["imaging", "fitting the base", "refining the scene without effects"]
+    kept = {file.stem for file in tmp_path.rglob("begun_*")}
+    assert {"begun_irf_tail", "begun_irf_tail_bare"} <= kept, "by effects: other versions have other kinds"
     said = []
     again, _ = diagnose(
         scene, second, options, name="x", seed=0, folder=tmp_path, report=lambda text, *_: said.append(text)
