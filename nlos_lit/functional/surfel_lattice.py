@@ -14,6 +14,7 @@ TAKEN = 0.55  # cells along x and y within which a surfel has a cell: its own, a
 FAINT = 0.03  # of the mean albedo, from which on a surfel has its whole say in where the sheet lies
 BACK = 0.35  # cosine by which flanks may face away from the wall: its far side sees them
 TURN = 0.4  # rad from one patch of a flank to the next, at most: beyond it patches are too long for it
+ENDS = 0.3  # length of what lacks of a surfel's neighbours, from which on its sheet ends there
 CHUNK = 1 << 22  # pairs of places and surfels at a time
 
 
@@ -138,6 +139,39 @@ def flank(
     turn = (facing * n).sum(1).clamp(-1, 1).acos()
     steep = (-facing[:, 2] < STEEP) & (facing[:, 2] < BACK) & (turn < TURN)
     return place[steep], facing[steep], torch.nonzero(source)[:, 0].repeat(2)[steep]
+
+
+def side(
+    centre: Tensor, normal: Tensor, outward: Tensor, source: Tensor, cell: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The sides of what has a thickness, as a box: behind each rim one patch at a right angle to the sheet.
+
+    It begins half a cell beyond the surfel, as nobody knows where in its cell the sheet ends, and faces the
+    way in which neighbours are missing.
+
+    Args:
+        centre: ``[M, 3]`` m.
+        normal: ``[M, 3]`` unit, towards the wall's side.
+        outward: ``[M, 3]`` of :class:`~nlos_lit.functional.surfel_graph.Sheet`.
+        source: ``[M]`` bool, surfels that may have one.
+        cell: ``[2]`` lateral extents, m.
+
+    Returns:
+        centres and normals of those that the wall may see, and which surfel each stands behind.
+
+    Examples:
+        >>> middle, facing = torch.tensor([[0.0, 0.0, 1.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+        >>> end = torch.tensor([[0.8, 0.0, 0.0]])
+        >>> place, out, _ = side(middle, facing, end, torch.tensor([True]), torch.tensor([0.02, 0.02]))
+        >>> [round(x, 3) for x in place[0].tolist()], out.tolist()
+        ([0.01, 0.0, 1.025], [[1.0, 0.0, 0.0]])
+    """
+    rim = source & (outward.norm(dim=1) > ENDS) & (-normal[:, 2] >= STEEP)
+    c, n, out = centre[rim], normal[rim], torch.nn.functional.normalize(outward[rim], dim=1)
+    wide = float(cell.max())
+    long = wide / (-out[:, 2:]).clamp_min(STEEP)
+    place, seen = c + wide / 2 * out - long / 2 * n, out[:, 2] < BACK
+    return place[seen], out[seen], torch.nonzero(rim)[seen, 0]
 
 
 def _near(places: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:

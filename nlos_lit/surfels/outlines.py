@@ -18,7 +18,7 @@ from torch import Tensor
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import level_of
-from nlos_lit.functional.surfel_lattice import flank, ring
+from nlos_lit.functional.surfel_lattice import flank, ring, side
 from nlos_lit.functional.surfel_paths import Runs
 from nlos_lit.surfels.growth import APART, best_apart, occupied, within_depths
 from nlos_lit.surfels.model import SurfelModel
@@ -33,10 +33,11 @@ CHUNK = 1 << 20  # paths at a time
 
 @torch.no_grad()
 def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
-    """Go on with all sheets by ``RINGS`` rings of cells, and along their flanks, within the grid's depths.
+    """Go on with all sheets by ``RINGS`` rings of cells, along their flanks and behind their rims, within the
+    grid's depths.
 
-    They hide nothing, and are hidden by what is there. Flanks go on from surfels that are there, since only
-    their curvature is known.
+    They hide nothing, and are hidden by what is there. Flanks and sides begin at surfels that are there: only
+    of these is it known how they curve, and where they end.
 
     Args:
         model: whose surfels get more neighbours.
@@ -46,7 +47,12 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
     origin = torch.tensor(model.lateral.origin, device=model.anchor.device)
     own, present, apart = model.albedo(), len(model), APART * float(model.cell.max())
     (centre, normal), albedo, curvature = model.placed(), own, model.curvature
-    down, falling, which = flank(centre, normal, curvature, own > SOURCE * own.mean(), model.cell)
+    source = own > SOURCE * own.mean()
+    flanks = flank(centre, normal, curvature, source, model.cell)
+    sides = side(centre, normal, model.outward, source, model.cell)
+    down, falling, which = (torch.cat(both) for both in zip(flanks, sides, strict=True))
+    bend = torch.cat([curvature[flanks[2]], curvature.new_zeros(len(sides[2]), 3, 3)])
+    light = torch.cat([own[flanks[2]], own[sides[2]]])
     chosen = best_apart(down, own[which], apart)
     chosen = chosen[~occupied(down[chosen], centre, apart)]
     for _ in range(RINGS):
@@ -56,8 +62,8 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         )
     flat = curvature.new_zeros(len(centre) - present, 3, 3)
     centre, normal = torch.cat([centre, down[chosen]]), torch.cat([normal, falling[chosen]])
-    albedo = torch.cat([albedo, own[which[chosen]]])
-    curvature = torch.cat([curvature, flat, curvature[which[chosen]]])
+    albedo = torch.cat([albedo, light[chosen]])
+    curvature = torch.cat([curvature, flat, bend[chosen]])
     inside = within_depths(centre, grid)
     inside[:present] = True
     centre, normal, albedo, curvature = (part[inside] for part in (centre, normal, albedo, curvature))

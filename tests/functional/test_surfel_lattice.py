@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from nlos_lit.functional.surfel_lattice import BACK, LAYER, TAKEN, TURN, flank, ring
+from nlos_lit.functional.surfel_lattice import BACK, ENDS, LAYER, TAKEN, TURN, flank, ring, side
+from nlos_lit.functional.surfel_paths import STEEP
 
 UP = torch.tensor([0.0, 0.0, -1.0])
 ORIGIN, CELL = torch.zeros(2), torch.tensor([0.1, 0.1])
@@ -151,6 +152,26 @@ def test_flat_sheets_have_no_flanks_however_they_lean():
     source, cell = torch.ones(3, dtype=torch.bool), torch.tensor([0.03, 0.03])
     assert len(flank(at, normal, 0 * curvature, source, cell)[0]) == 0
     assert len(flank(at, normal, curvature, ~source, cell)[0]) == 0
+
+
+@pytest.mark.parametrize(("lacks", "stands"), [(0.01, 1), (-0.01, 0)])
+def test_a_side_stands_behind_what_ends_and_the_wall_may_see_it(lacks, stands):
+    """Just above what must lack, and facing away by just less than the wall's far side sees; nowhere else."""
+    cell, one = torch.tensor([0.03, 0.03]), torch.ones(1, dtype=torch.bool)
+    at, ahead = torch.tensor([[0.1, 0.0, 0.8]]), torch.tensor([[0.0, 0.0, -1.0]])
+    way = torch.tensor([[0.0, 1.0, 0.0]])
+    assert len(side(at, ahead, (ENDS + lacks) * way, one, cell)[0]) == stands
+    tilt = math.asin(BACK - lacks)
+    normal = torch.tensor([[0.0, math.sin(tilt), -math.cos(tilt)]])
+    away = torch.tensor([[0.0, math.cos(tilt), math.sin(tilt)]])
+    assert len(side(at, normal, away, one, cell)[0]) == stands
+    place, out, which = side(at, normal, -away, one, cell)  # the other end leans towards the wall
+    assert torch.allclose(out, -away)
+    assert which.tolist() == [0]
+    assert float((place - at)[0] @ -away[0]) == pytest.approx(0.015)
+    assert float((place - at)[0] @ -normal[0]) == pytest.approx(0.03 / max(STEEP, math.sin(tilt)) / 2)
+    assert len(side(at, normal, -away, ~one, cell)[0]) == 0
+    assert len(side(at, away, -normal, one, cell)[0]) == 0  # of what stands itself
 
 
 @pytest.mark.parametrize(("below", "begun"), [(0.02, 1), (-0.02, 0)])

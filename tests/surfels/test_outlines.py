@@ -14,6 +14,7 @@ from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
 from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import level_of
+from nlos_lit.functional.surfel_lattice import side
 from nlos_lit.functional.surfel_paths import STEEP
 from nlos_lit.surfels.fit import FINEST, Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.model import SurfelModel
@@ -186,6 +187,52 @@ def test_round_sheets_go_on_down_their_flanks():
             assert torch.equal(model.curvature[3:][steep], bend[2:])
             away = (model.centre().detach()[3:][steep] - axis)[0, [0, 2]].norm()
             assert abs(float(away) - radius) < 0.02
+
+
+def test_behind_rims_stand_sides_where_it_is_known_where_sheets_end():
+    """Behind all but the middle one of nine surfels, faced outwards, flat and hiding nothing; none where
+    surfels have just come, as halves of wider ones have.
+    """
+    for known in (True, False):
+        model = board(torch.ones(3, 3), z=0.5)
+        if known:
+            model.lay()
+            model.lift()
+        extend(model, DEEP, SPOTS)
+        centre, normal = (part.detach() for part in model.placed())
+        stands = -normal[:, 2] < STEEP
+        assert int(stands.sum()) == (8 if known else 0)
+        out, at = normal[stands], centre[stands]
+        assert ((out * at).sum(1) > 0.9 * CELL).all()
+        assert torch.allclose(at[:, 2], torch.tensor(0.5 + CELL / STEEP / 2), atol=1e-4)
+        assert not model.curvature[stands].any()
+        assert not model.opacity()[stands].gt(1e-6).any()
+
+
+def test_sides_stay_where_something_is_thick():
+    """Counts of a board with sides are explained by sides; where it has none they are cut back."""
+    for sides in (True, False):
+        true = board(torch.ones(5, 5), z=0.5)
+        true.lay()
+        true.lift()
+        place, out, _ = side(*true.placed(), true.outward, torch.ones(25, dtype=torch.bool), true.cell)
+        centre, normal = true.placed()
+        if sides:
+            centre, normal = torch.cat([centre, place]), torch.cat([normal, out])
+        true.place(centre, normal, torch.ones(len(centre)))
+        true.update_hiders()
+        counts = torch.poisson(true.expected(SPOTS), generator=torch.Generator().manual_seed(1))
+        model = board(torch.ones(5, 5), z=0.5)
+        model.lay()
+        model.lift()
+        model.update_hiders()
+        before = model.albedo().detach()
+        extend(model, DEEP, SPOTS)
+        solve_albedos(model, SPOTS, counts, (0.7, 1.0, 3.0), 4 * SEARCH)
+        cut_back(model, before)
+        stands = -model.normal().detach()[:, 2] < STEEP
+        light = float(model.albedo().detach()[stands].sum()) / len(place)
+        assert light > 0.6 if sides else light == 0.0
 
 
 def test_faint_surfels_are_not_extended():
