@@ -448,8 +448,7 @@ def report() -> None:
         [
             test_set(test),
             f"## The last {LAST} looks at the validation set, together\n\n"
-            f"Captures {span(last)}, each look by another state of the program, all older than the\n"
-            f"frozen rules.\n\n{rates(last)}\n",
+            f"Captures {span(last)}, each look by another state of the program.\n\n{rates(last)}\n",
         ],
     )
     newest = {c["index"]: c for c in development}
