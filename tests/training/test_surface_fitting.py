@@ -42,7 +42,7 @@ SMALL = [
     "callbacks.figures.every=20", "surfels.contest=4", "surfels.rounds=2", "surfels.steps=8",
     "surfels.outlines=1", "surfels.more=1", "export.transients=2", "threads=1",
 ]  # fmt: skip
-EFFECTS = "effects=[irf_tail,crosstalk]"
+EFFECTS = "effects=[irf_tail,power_drift]"
 
 
 def door(
@@ -253,7 +253,7 @@ def test_the_door_leaves_a_surface(finished):
     assert heldout["nmse"]["final"] < heldout["nmse"]["initial"]
     assert refined["heldout"]["nmse"] == pytest.approx(heldout["nmse"]["final"], rel=1e-3)
     assert summary["iterations"] == 4 + 8 + 16 + 8 + 16 + 16  # the last is an added one
-    assert {"sigma_ls", "irf_tail.fraction", "crosstalk.leak"} <= set(summary["parameters"])
+    assert {"sigma_ls", "irf_tail.fraction", "power_drift.rms"} <= set(summary["parameters"])
     place = finished / "refined"
     assert {path.name for path in place.iterdir()} >= {
         "points.ply", "surfels.pt", "effects.pt", "transients.png", "surface.png", "overview.png",
