@@ -31,6 +31,7 @@ from nlos_lit.functional.surfel_graph import (
     neighbour_pairs,
     sheet_normals,
 )
+from nlos_lit.functional.surfel_paths import STEEP
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels import growth, start
 from nlos_lit.surfels.effect_start import asked_of, choose_shapes
@@ -758,6 +759,7 @@ def test_memory_is_that_of_a_step_or_of_the_paths_that_are_kept(fitted, monkeypa
 def test_the_counts_say_how_much_dark_surfels_hide(fitted, opacity):
     fit = fitted[-1].fit.copy(Extension([]), 0)
     model = fit.model
+    model.keep(-model.normal()[:, 2] > STEEP)  # sides hide their neighbours
     front = model.centre()[:, 2] < 0.62
     model.set_albedo(torch.where(front, 0.1, 1.0).to(front.device))
     model.update_hiders()
