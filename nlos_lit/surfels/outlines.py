@@ -37,7 +37,8 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
     grid's depths.
 
     They hide nothing, and are hidden by what is there. Flanks and sides begin at surfels that are there: only
-    of these is it known how they curve, and where they end.
+    of these is it known how they curve, and where their sheets ended when they were laid. So halves of wider
+    surfels get no sides until they have been.
 
     Args:
         model: whose surfels get more neighbours.
@@ -52,7 +53,6 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
     sides = side(centre, normal, model.outward, source, model.cell)
     down, falling, which = (torch.cat(both) for both in zip(flanks, sides, strict=True))
     bend = torch.cat([curvature[flanks[2]], curvature.new_zeros(len(sides[2]), 3, 3)])
-    light = torch.cat([own[flanks[2]], own[sides[2]]])
     chosen = best_apart(down, own[which], apart)
     chosen = chosen[~occupied(down[chosen], centre, apart)]
     for _ in range(RINGS):
@@ -62,7 +62,7 @@ def extend(model: SurfelModel, grid: VolumeGrid, spots: Tensor) -> None:
         )
     flat = curvature.new_zeros(len(centre) - present, 3, 3)
     centre, normal = torch.cat([centre, down[chosen]]), torch.cat([normal, falling[chosen]])
-    albedo = torch.cat([albedo, light[chosen]])
+    albedo = torch.cat([albedo, own[which[chosen]]])
     curvature = torch.cat([curvature, flat, bend[chosen]])
     inside = within_depths(centre, grid)
     inside[:present] = True
