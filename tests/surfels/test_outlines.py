@@ -189,15 +189,20 @@ def test_round_sheets_go_on_down_their_flanks():
             assert abs(float(away) - radius) < 0.02
 
 
+def laid_board(n: int) -> SurfelModel:
+    """A board of ``n`` × ``n`` bright cells at 0.5 m, of which it is known where it ends."""
+    model = board(torch.ones(n, n), z=0.5)
+    model.lay()
+    model.lift()
+    return model
+
+
 def test_behind_rims_stand_sides_where_it_is_known_where_sheets_end():
     """Behind all but the middle one of nine surfels, faced outwards, flat and hiding nothing; none where
     surfels have just come, as halves of wider ones have.
     """
     for known in (True, False):
-        model = board(torch.ones(3, 3), z=0.5)
-        if known:
-            model.lay()
-            model.lift()
+        model = laid_board(3) if known else board(torch.ones(3, 3), z=0.5)
         extend(model, DEEP, SPOTS)
         centre, normal = (part.detach() for part in model.placed())
         stands = -normal[:, 2] < STEEP
@@ -212,9 +217,7 @@ def test_behind_rims_stand_sides_where_it_is_known_where_sheets_end():
 def test_sides_stay_where_something_is_thick():
     """Counts of a board with sides are explained by sides; where it has none they are cut back."""
     for sides in (True, False):
-        true = board(torch.ones(5, 5), z=0.5)
-        true.lay()
-        true.lift()
+        true = laid_board(5)
         place, out, _ = side(*true.placed(), true.outward, torch.ones(25, dtype=torch.bool), true.cell)
         centre, normal = true.placed()
         if sides:
@@ -222,9 +225,7 @@ def test_sides_stay_where_something_is_thick():
         true.place(centre, normal, torch.ones(len(centre)))
         true.update_hiders()
         counts = torch.poisson(true.expected(SPOTS), generator=torch.Generator().manual_seed(1))
-        model = board(torch.ones(5, 5), z=0.5)
-        model.lay()
-        model.lift()
+        model = laid_board(5)
         model.update_hiders()
         before = model.albedo().detach()
         extend(model, DEEP, SPOTS)
