@@ -34,6 +34,8 @@ PLAIN = (
     "bodies",
     "before",
     "undo",
+    "latest",
+    "rival",
     "finer",
     "priced",
     "bend",
@@ -42,6 +44,7 @@ PLAIN = (
 )
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 AGAIN = 25  # batches after which it is asked again how rough sheets are
+PLAN, DIVISION, ROUND, UNDONE = "plan", "division", "round without", "round undone"  # what came last
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -238,6 +241,8 @@ class SurfelFit:
         self.more, self.bodies = 0, 0  # rounds that may follow, and those before which bodies are begun
         self.before = torch.zeros(0)  # nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
+        self.latest = PLAN  # what the surfels have been through
+        self.rival: dict[str, Any] | None = None  # what dividing them again came to, until it is judged
         self.priced = True  # no round was judged yet: surfels cost something
         self.finer = True  # surfels may be divided before one of them
         self.bend = BEND  # rad, by how much neighbours are taken to misfit
@@ -382,8 +387,10 @@ class SurfelFit:
         better by more than the standard error of it, or is undone. Before the first of them bodies are begun
         that are missing (:func:`~nlos_lit.surfels.growth.begin_bodies`), as long as there are any and it
         helps. Before the others, since bright captures take longer to converge and show finer detail, surfels
-        are divided in four while they may be. Where that was undone they stay as they are, and where a round
-        without it was, none follows.
+        are divided in four while they may be. To be divided once more must predict better than a round
+        without it, from the same surfels, in the same way; where it does not, it waits until such rounds are
+        undone. Where a division was undone surfels stay as they are, and where a round without it was, too,
+        none follows.
 
         Args:
             plan: the rounds.
@@ -391,7 +398,8 @@ class SurfelFit:
             bodies: … and before them those that look for missing bodies.
         """
         self.plan, self.more, self.bodies = list(plan), more, bodies
-        self.undo, self.finer = None, self.settings.subdivide is None
+        self.undo, self.rival, self.latest = None, None, PLAN
+        self.finer = self.settings.subdivide is None
         self._add_round()
 
     def _add_round(self) -> None:
@@ -399,33 +407,55 @@ class SurfelFit:
             return
         nats, above_noise = self._predicted()
         tried, self.undo = self.undo, None
-        if tried is not None and not _better(nats, self.before):
-            nats, above_noise, cells = self.before, True, self.model.lateral.shape
-            self._take_back(tried)
-            divided = self.model.lateral.shape != cells
-            if self.bodies:
-                self.bodies = 0
+        if tried is not None:
+            divided, stays = self.model.lateral.shape != tried["cells"], _better(nats, self.before)
+            if divided and stays and self.latest == DIVISION:
+                self.rival = {**self._kept(), "predicted": (nats, above_noise)}
+                self._take_back(tried)
+                self._plan_one(1, self.before)
+                return
+            if not stays:
+                nats, above_noise = self.before, True
+                self._take_back(tried)
+            if self.rival is not None:
+                rival, self.rival = self.rival, None
+                if _better(rival["predicted"][0], nats):
+                    self._take_back(rival)
+                    nats, above_noise = rival["predicted"]
+                else:
+                    self.latest = ROUND
+            elif self.bodies:
+                self.bodies = self.bodies - 1 if stays else 0
+            elif stays:
+                self.latest = DIVISION if divided else ROUND
+            elif divided:
+                self.finer = False
             else:
-                self.finer, self.more = False, self.more if divided else 0
-        elif tried is not None:
-            self.bodies = max(0, self.bodies - 1)
+                self.latest = UNDONE
         if not above_noise or not (self.more or self.bodies):
             return
-        model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
-        undo = copy.deepcopy({"model": model, "extension": extension})
-        parts = 1
+        begin, parts = self._kept(), 1
         if self.bodies and not self._begin_bodies():
             self.bodies = 0
         if not self.bodies:
-            if not self.more:
-                return
-            self.more -= 1
             s, wide = self.settings, float(self.model.cell.max()) > FINEST * self.model.bin_length
             divide = self.finer and wide and 4 * len(self.model) <= s.most
-            parts = 2 if divide else 1
+            if not self.more or (self.latest == UNDONE and not divide):
+                return
+            self.more -= 1
+            parts = 2 if divide and self.latest != ROUND else 1
+        self._plan_one(parts, nats, begin)
+
+    def _kept(self) -> dict[str, Any]:
+        """A copy of surfels, response and effects."""
+        model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
+        return copy.deepcopy({"model": model, "extension": extension, "cells": self.model.lateral.shape})
+
+    def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any] | None = None) -> None:
+        """A round of outlines, to be undone unless it gains on ``nats``."""
         self.priced = False
+        self.before, self.undo = nats, begin or self._kept()
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
-        self.before, self.undo = nats, undo
 
     def _begin_bodies(self) -> int:
         return begin_bodies(self.model, self.grid, self._place_test(), self.reserve)

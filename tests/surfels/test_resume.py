@@ -198,6 +198,50 @@ def test_a_plan_is_the_rounds_in_order():
     assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, scan_shapes=True)) == 2
 
 
+def tried(fit: SurfelFit, values: list[int], monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+    """Into how many parts each round divides, and cells a side that are left, if rounds come to such nats."""
+    monkeypatch.setattr(fitting, "FINEST", 0.0)
+    ahead = iter(values)
+    monkeypatch.setattr(
+        SurfelFit, "_predicted", lambda self: (torch.full((len(self.judged),), float(next(ahead))), True)
+    )
+    fit.settings = dataclasses.replace(SETTINGS, most=10**6)
+    fit.schedule([], more=8)
+    before, seen = fit.model.lateral.shape[0], []
+    for _ in values[1:]:
+        parts = fit.plan[0].parts
+        if parts > 1:
+            fit.model.divide(parts)
+        fit.plan = []
+        fit._add_round()
+        seen.append((parts, fit.model.lateral.shape[0] // before))
+    return seen
+
+
+def test_surfels_are_divided_again_where_that_predicts_more_than_a_round_without(monkeypatch):
+    """From the same surfels, whatever a round without it gains: one that is undone leaves nothing behind."""
+    fit = begun()
+    assert tried(fit, [0, 10, 15, 12], monkeypatch) == [(2, 2), (2, 2), (1, 4)]
+    assert fit.plan[0].parts == 2, "which may be divided once more"
+    assert tried(begun(), [0, 10, 15, 9], monkeypatch) == [(2, 2), (2, 2), (1, 4)]
+
+
+def test_surfels_that_gain_more_undivided_are_divided_when_they_gain_no_more(monkeypatch):
+    fit = begun()
+    values = [0, 10, 15, 18, 20, 19, 25]
+    assert tried(fit, values, monkeypatch) == [(2, 2), (2, 2), (1, 2), (1, 2), (1, 2), (2, 4)]
+    fit = begun()
+    values[-1] = 19
+    assert tried(fit, values, monkeypatch) == [(2, 2), (2, 2), (1, 2), (1, 2), (1, 2), (2, 2)]
+    assert fit.finished, "neither a round without nor a division does any more"
+
+
+def test_a_scene_that_no_division_helps_goes_on_as_coarse_as_it_is(monkeypatch):
+    fit = begun()
+    assert tried(fit, [0, -1, 5, 4], monkeypatch) == [(2, 1), (1, 1), (1, 1)]
+    assert fit.finished
+
+
 def test_seeds_stand_still_while_they_contest_and_faint_ones_go():
     fit = begun()
     fit.settings = dataclasses.replace(SETTINGS, albedo_rate=1e-6)
