@@ -409,7 +409,8 @@ class SurfelFit:
         tried, self.undo = self.undo, None
         if tried is not None:
             divided, stays = self.model.lateral.shape != tried["cells"], _better(nats, self.before)
-            if divided and stays and self.latest == DIVISION:
+            if divided and stays and self.latest == DIVISION and self.more:
+                self.more -= 1
                 self.rival = {**self._kept(), "predicted": (nats, above_noise)}
                 self._take_back(tried)
                 self._plan_one(1, self.before)

@@ -198,7 +198,9 @@ def test_a_plan_is_the_rounds_in_order():
     assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, scan_shapes=True)) == 2
 
 
-def tried(fit: SurfelFit, values: list[int], monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, int]]:
+def tried(
+    fit: SurfelFit, values: list[int], monkeypatch: pytest.MonkeyPatch, more: int = 8
+) -> list[tuple[int, int]]:
     """Into how many parts each round divides, and cells a side that are left, if rounds come to such nats."""
     monkeypatch.setattr(fitting, "FINEST", 0.0)
     ahead = iter(values)
@@ -206,7 +208,7 @@ def tried(fit: SurfelFit, values: list[int], monkeypatch: pytest.MonkeyPatch) ->
         SurfelFit, "_predicted", lambda self: (torch.full((len(self.judged),), float(next(ahead))), True)
     )
     fit.settings = dataclasses.replace(SETTINGS, most=10**6)
-    fit.schedule([], more=8)
+    fit.schedule([], more)
     before, seen = fit.model.lateral.shape[0], []
     for _ in values[1:]:
         parts = fit.plan[0].parts
@@ -224,6 +226,15 @@ def test_surfels_are_divided_again_where_that_predicts_more_than_a_round_without
     assert tried(fit, [0, 10, 15, 12], monkeypatch) == [(2, 2), (2, 2), (1, 4)]
     assert fit.plan[0].parts == 2, "which may be divided once more"
     assert tried(begun(), [0, 10, 15, 9], monkeypatch) == [(2, 2), (2, 2), (1, 4)]
+
+
+def test_no_more_rounds_than_may_be_added_are(monkeypatch):
+    fit = begun()
+    assert tried(fit, [0, 10, 15], monkeypatch, more=2) == [(2, 2), (2, 4)]
+    assert fit.finished, "the round that it would be held against would be the third"
+    fit = begun()
+    assert tried(fit, [0, 10, 15, 18], monkeypatch, more=3) == [(2, 2), (2, 2), (1, 2)]
+    assert fit.finished
 
 
 def test_surfels_that_gain_more_undivided_are_divided_when_they_gain_no_more(monkeypatch):
