@@ -44,7 +44,7 @@ PLAIN = (
 )
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 AGAIN = 25  # batches after which it is asked again how rough sheets are
-PLAN, DIVISION, ROUND, UNDONE = "plan", "division", "round without", "round undone"  # what came last
+PLAN, DIVISION, ROUND, UNDONE = "plan", "division", "round without", "round undone"  # see schedule
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -241,7 +241,7 @@ class SurfelFit:
         self.more, self.bodies = 0, 0  # rounds that may follow, and those before which bodies are begun
         self.before = torch.zeros(0)  # nats before the latest of them
         self.undo: dict[str, Any] | None = None  # what that began with
-        self.latest = PLAN  # what the surfels have been through
+        self.latest = PLAN  # what came last of PLAN, DIVISION, ROUND and UNDONE
         self.rival: dict[str, Any] | None = None  # what dividing them again came to, until it is judged
         self.priced = True  # no round was judged yet: surfels cost something
         self.finer = True  # surfels may be divided before one of them
@@ -413,7 +413,7 @@ class SurfelFit:
                 self.more -= 1
                 self.rival = {**self._kept(), "predicted": (nats, above_noise)}
                 self._take_back(tried)
-                self._plan_one(1, self.before)
+                self._plan_one(1, self.before, tried)
                 return
             if not stays:
                 nats, above_noise = self.before, True
@@ -452,10 +452,9 @@ class SurfelFit:
         model, extension = dict(self.model.state_dict()), dict(self.extension.state_dict())
         return copy.deepcopy({"model": model, "extension": extension, "cells": self.model.lateral.shape})
 
-    def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any] | None = None) -> None:
-        """A round of outlines, to be undone unless it gains on ``nats``."""
-        self.priced = False
-        self.before, self.undo = nats, begin or self._kept()
+    def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any]) -> None:
+        """A round of outlines, to go back to what it begins with unless it gains on ``nats``."""
+        self.priced, self.before, self.undo = False, nats, begin
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
 
     def _begin_bodies(self) -> int:

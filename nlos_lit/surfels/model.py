@@ -640,7 +640,7 @@ class SurfelModel(nn.Module):
         lateral = Lateral(*(tuple(v) for v in extra["lateral"]))
         model = cls(
             capture,
-            centre=state["anchor"],
+            centre=state["anchor"].clone(),  # what becomes of the model must not change the state
             normal=normal,
             albedo=torch.ones(m),
             lateral=lateral,

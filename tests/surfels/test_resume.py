@@ -121,6 +121,17 @@ def test_a_state_is_a_copy():
     assert same(kept, before)
 
 
+def test_surfels_that_are_taken_back_leave_what_was_kept_as_it_is():
+    """Rounds that are undone go back to it more than once."""
+    fit = begun()
+    kept = fit._kept()
+    before = copy.deepcopy(kept)
+    fit._take_back(kept)
+    for buffer in (*fit.model.buffers(), *fit.model.parameters()):
+        buffer.detach().zero_()
+    assert same(kept["model"], before["model"])
+
+
 def test_a_fit_of_another_version_is_refused():
     fit = begun()
     kept = fit.state()
