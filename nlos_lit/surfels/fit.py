@@ -15,6 +15,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.capture.wall_blocks import wall_blocks
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import BEND, Sheet
@@ -37,11 +38,12 @@ PLAIN = (
     "latest",
     "rival",
     "finer",
-    "priced",
+    "area",
     "bend",
     "history",
     "losses",
 )
+PATCHES = 16  # along each side of the wall: spots are set aside, and their gains scatter, by patches
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 AGAIN = 25  # batches after which it is asked again how rough sheets are
 PLAN, DIVISION, ROUND, UNDONE = "plan", "division", "round without", "round undone"  # see schedule
@@ -77,8 +79,8 @@ class SurfelSettings:
             it for the logarithm of a prior.
         evenness: weight against albedos that differ between neighbours …
         brightness: … or are beyond the scene's own level (:meth:`SurfelModel.albedo_cost`).
-        lean: nats that each surfel costs that is there, however faint, while sheets find their outlines;
-            nothing any more when rounds follow that are judged by what they predict.
+        lean: nats that each surfel costs that is there, however faint, from where sheets find their outlines;
+            divided ones cost as much together as they did.
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
@@ -243,7 +245,7 @@ class SurfelFit:
         self.undo: dict[str, Any] | None = None  # what that began with
         self.latest = PLAN  # what came last of PLAN, DIVISION, ROUND and UNDONE
         self.rival: dict[str, Any] | None = None  # what dividing them again came to, until it is judged
-        self.priced = True  # no round was judged yet: surfels cost something
+        self.area = math.inf  # m², of surfels when outlines are first found: what is as wide costs `lean`
         self.finer = True  # surfels may be divided before one of them
         self.bend = BEND  # rad, by how much neighbours are taken to misfit
         self.history: list[dict[str, float]] = []
@@ -265,7 +267,7 @@ class SurfelFit:
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
         order = torch.randperm(len(self.train), generator=generator)
         other = SurfelFit(model, *parts, extension, generator, order, self.judged)
-        other.priced = self.priced
+        other.area = self.area
         return other
 
     def parts(self) -> dict[str, Any]:
@@ -384,13 +386,13 @@ class SurfelFit:
         """Say what is to be done next; it takes the place of what was.
 
         Last rounds of outlines are added while the fit is above the noise. Each must predict the judged spots
-        better by more than the standard error of it, or is undone. Before the first of them bodies are begun
-        that are missing (:func:`~nlos_lit.surfels.growth.begin_bodies`), as long as there are any and it
-        helps. Before the others, since bright captures take longer to converge and show finer detail, surfels
-        are divided in four while they may be. To be divided once more must predict better than a round
-        without it, from the same surfels, in the same way; where it does not, it waits until such rounds are
-        undone. Where a division was undone surfels stay as they are, and where a round without it was, too,
-        none follows.
+        better by more than the standard error that patches of the wall leave of it, or is undone. Before the
+        first of them bodies are begun that are missing (:func:`~nlos_lit.surfels.growth.begin_bodies`), as
+        long as there are any and it helps. Before the others, since bright captures take longer to converge
+        and show finer detail, surfels are divided in four while they may be. To be divided once more must
+        predict better than a round without it, from the same surfels, in the same way; where it does not, it
+        waits until such rounds are undone. Where a division was undone surfels stay as they are, and where a
+        round without it was, too, none follows.
 
         Args:
             plan: the rounds.
@@ -408,7 +410,7 @@ class SurfelFit:
         nats, above_noise = self._predicted()
         tried, self.undo = self.undo, None
         if tried is not None:
-            divided, stays = self.model.lateral.shape != tried["cells"], _better(nats, self.before)
+            divided, stays = self.model.lateral.shape != tried["cells"], self._better(nats, self.before)
             if divided and stays and self.latest == DIVISION and self.more:
                 self.more -= 1
                 self.rival = {**self._kept(), "predicted": (nats, above_noise)}
@@ -420,7 +422,7 @@ class SurfelFit:
                 self._take_back(tried)
             if self.rival is not None:
                 rival, self.rival = self.rival, None
-                if _better(rival["predicted"][0], nats):
+                if self._better(rival["predicted"][0], nats):
                     self._take_back(rival)
                     nats, above_noise = rival["predicted"]
                 else:
@@ -454,7 +456,7 @@ class SurfelFit:
 
     def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any]) -> None:
         """A round of outlines, to go back to what it begins with unless it gains on ``nats``."""
-        self.priced, self.before, self.undo = False, nats, begin
+        self.before, self.undo = nats, begin
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
 
     def _begin_bodies(self) -> int:
@@ -528,6 +530,7 @@ class SurfelFit:
             self.model.set_opacity(unknown_opacity(self.model.albedo().detach()))
         self._hide(now.outline)
         if now.outline:
+            self.area = self._own_area() if self.area == math.inf else self.area
             before = self.model.albedo().detach()
             extend(self.model, self.grid, spots)
             solve_albedos(self.model, spots, counts, self._albedo_weights(), SEARCH, self.extension)
@@ -620,7 +623,10 @@ class SurfelFit:
     def _albedo_weights(self) -> tuple[float, float, float]:
         """Of what albedos cost in the present round."""
         s = self.settings
-        return s.evenness, s.brightness, s.lean if self.priced and self._outlined else 0.0
+        return s.evenness, s.brightness, s.lean * self._own_area() / self.area if self._outlined else 0.0
+
+    def _own_area(self) -> float:
+        return float(self.model.cell.prod())
 
     def step(self) -> None:
         """One batch."""
@@ -702,11 +708,15 @@ class SurfelFit:
         nats = (torch.xlogy(counts, expected.clamp_min(1e-9)) - expected).double().sum(1)
         return nats, scores.deviance_per_bin > scores.deviance_noise
 
+    def _better(self, nats: Tensor, before: Tensor) -> bool:
+        """Whether spots are likelier by more than the standard error that patches of the wall leave of it.
 
-def _better(nats: Tensor, before: Tensor) -> bool:
-    """Whether spots are likelier by more than the standard error that they leave of it."""
-    gain = nats - before
-    return float(gain.sum()) > math.sqrt(len(gain)) * float(gain.std(correction=0))
+        By patches, since neighbours err alike: what the model has wrong is smooth over the wall.
+        """
+        gain = nats - before
+        patch = torch.from_numpy(wall_blocks(self.capture, PATCHES))[self.judged.cpu()]
+        left = gain.new_zeros(PATCHES**2).index_add(0, patch, gain - gain.mean())
+        return float(gain.sum()) > float(left.norm())
 
 
 @torch.no_grad()

@@ -11,10 +11,11 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.capture.wall_blocks import wall_blocks
 from nlos_lit.effects.extension import Extension
 from nlos_lit.model.laser_sensor import LaserSensor
 from nlos_lit.runtime.memory import check_machine
-from nlos_lit.surfels.fit import SurfelFit, SurfelSettings, plan_from_seeds
+from nlos_lit.surfels.fit import PATCHES, SurfelFit, SurfelSettings, plan_from_seeds
 from nlos_lit.surfels.growth import rank_one, score, start_response, volume_maxima
 from nlos_lit.surfels.model import Lateral, SurfelModel, points_along
 
@@ -52,7 +53,8 @@ def seed_surfels(
         scan_shapes: after a first round start the extension's scanned parameters where the counts ask for
             them, instead of where they are; costs one round more.
         judge_spots: ``[J]`` rows that are not trained, by which it is judged how fine the surfels are to be.
-            None sets a tenth of the training spots aside for it, where that is asked (``settings.more``).
+            None sets patches of the wall with a tenth of the training spots aside for it, where that is asked
+            (``settings.more``).
 
     Returns:
         a fit with all its rounds ahead.
@@ -68,7 +70,7 @@ def seed_surfels(
         )
     s, extension = settings, Extension([]) if extension is None else extension
     intensity = intensity.detach().cpu().float()
-    apart = _apart(train_spots, seed, s.more) if judge_spots is None else (train_spots, judge_spots)
+    apart = _apart(capture, train_spots, seed, s.more) if judge_spots is None else (train_spots, judge_spots)
     train, judged = (torch.as_tensor(np.asarray(rows), dtype=torch.long) for rows in apart)
     first, last = capture.gate
     counts = torch.from_numpy(capture.counts[train.numpy(), first:last].astype(np.float32))
@@ -121,8 +123,13 @@ def seed_surfels(
     return fit
 
 
-def _apart(spots: np.ndarray, seed: int, more: int) -> tuple[np.ndarray, np.ndarray]:
-    """Training spots, and those of them that are set aside where rounds may follow those of the plan."""
+def _apart(capture: Capture, spots: np.ndarray, seed: int, more: int) -> tuple[np.ndarray, np.ndarray]:
+    """Training spots, and those of them that are set aside where rounds may follow those of the plan.
+
+    These are patches of the wall: what imitates the misfit of the spots around one pays there, too.
+    """
     number = len(spots) // ASIDE if more else 0
-    mixed = np.random.default_rng(seed).permutation(spots)
+    block = wall_blocks(capture, PATCHES)[spots]
+    order = np.random.default_rng(seed).permutation(PATCHES**2)
+    mixed = spots[np.argsort(order[block], kind="stable")]
     return np.sort(mixed[number:]), np.sort(mixed[:number])

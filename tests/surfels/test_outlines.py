@@ -12,6 +12,7 @@ from torch import Tensor
 
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid
+from nlos_lit.capture.wall_blocks import wall_blocks
 from nlos_lit.effects.extension import Extension
 from nlos_lit.functional.surfel_graph import level_of
 from nlos_lit.functional.surfel_lattice import side
@@ -306,7 +307,7 @@ def waiting(change: dict | None = None) -> SurfelFit:
     fit.settings = dataclasses.replace(
         SurfelSettings(steps=1, quadrature=1, visibility=False), **(change or {})
     )
-    fit.grid = DEEP
+    fit.grid, fit.judged = DEEP, torch.arange(4)
     return fit
 
 
@@ -366,30 +367,32 @@ def test_missing_bodies_come_first_while_there_are_any_and_they_help(monkeypatch
     assert began == seen
 
 
-def test_surfels_cost_something_from_outlines_until_rounds_are_judged(monkeypatch):
-    """A copy, and a fit that is restored, know whether they still do."""
+def test_surfels_cost_as_much_as_their_area_from_outlines_on(monkeypatch):
+    """A copy, and a fit that is restored, know how wide those were that cost as much as any."""
 
-    def costs(fit: SurfelFit) -> bool:
+    def cost(fit: SurfelFit) -> float:
+        """Nats: of a surfel as bright as the scene's level ``lean`` / 1.1."""
         found = []
         for lean in (0.0, 5.0):
             fit.settings = dataclasses.replace(fit.settings, lean=lean)
-            found.append(fit.loss(torch.arange(8))["albedos"].item())
-        return found[1] > found[0]
+            found.append(fit.loss(torch.arange(8))["albedos"].item() * len(fit.train) * fit.counts.shape[1])
+        return found[1] - found[0]
 
     fit = waiting()
-    for plan, told in (([Round(1, grow=True)], False), ([Round(1, outline=True)], True)):
-        fit.schedule(plan)
-        assert costs(fit) == told
-    fit.schedule([Round(1, onward=True)])
-    assert costs(fit)
-    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
-    fit.schedule([], 1)
-    assert not costs(fit)
+    fit.schedule([Round(1, grow=True)])
+    assert cost(fit) == 0
+    monkeypatch.setattr("nlos_lit.surfels.fit.extend", lambda *_: None)
+    monkeypatch.setattr("nlos_lit.surfels.fit.solve_albedos", lambda *_: None)
+    for parts in (1, 2):
+        fit.schedule([Round(1, parts=parts, outline=True)])
+        fit.begin_round()
+        assert len(fit.model) == 25 * parts**2
+        assert cost(fit) == pytest.approx(5 * 25 / 1.1, rel=1e-3)
     other, again = fit.copy(fit.extension, 0), waiting()
     again.restore(fit.state())
     for each in (other, again):
         each.schedule([Round(1, onward=True)])
-        assert not costs(each)
+        assert cost(each) == pytest.approx(5 * 25 / 1.1, rel=1e-3)
 
 
 @pytest.mark.parametrize("divided", [True, False])
@@ -414,6 +417,16 @@ def test_a_round_that_predicts_nothing_better_is_undone(monkeypatch, divided, ga
     assert kept != stays
     # Where finer surfels did not pay those that were go on; where these did not, nothing does.
     assert [each.parts for each in fit.plan] == ([2 if divided else 1] if stays else [1] if divided else [])
+
+
+@pytest.mark.parametrize(("gain", "stays"), [(0.70, False), (0.71, True)])
+def test_spots_of_one_patch_that_gain_together_count_as_one(monkeypatch, gain, stays):
+    """Two patches of two spots, whose gains are 1 above and 1 below the mean: their sum errs by √8."""
+    fit = waiting()
+    monkeypatch.setattr("nlos_lit.surfels.fit.PATCHES", 5)
+    assert [*wall_blocks(WALL, 5)[fit.judged]] == [0, 0, 1, 1]
+    before = torch.zeros(4, dtype=torch.double)
+    assert fit._better(before + gain + torch.tensor([1.0, 1.0, -1.0, -1.0]), before) == stays
 
 
 def test_the_level_does_not_ask_how_many_dark_surfels_lie_around():

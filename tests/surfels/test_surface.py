@@ -19,6 +19,7 @@ from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.scan import Scan
 from nlos_lit.capture.volume_grid import VolumeGrid, volume_grid
+from nlos_lit.capture.wall_blocks import wall_blocks
 from nlos_lit.effects import EFFECTS, build_effects
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import Hooks
@@ -35,7 +36,7 @@ from nlos_lit.functional.surfel_paths import STEEP
 from nlos_lit.model.build import PipelineSettings, build_pipeline
 from nlos_lit.surfels import growth, start
 from nlos_lit.surfels.effect_start import asked_of, choose_shapes
-from nlos_lit.surfels.fit import Round, SurfelFit, SurfelSettings, score_spots
+from nlos_lit.surfels.fit import PATCHES, Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.fitted import FittedSurfels, fit_surfels
 from nlos_lit.surfels.growth import (
     PlaceTest,
@@ -171,6 +172,9 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
     assert len(judged) == len(train) // 10
     assert judged | train_of_it == set(train)
     assert not judged & train_of_it
+    patch = wall_blocks(capture, PATCHES)
+    cut = {int(patch[spot]) for spot in judged} & {int(patch[spot]) for spot in train_of_it}
+    assert len(cut) <= 1, "whole patches are set aside: neighbours would tell of them"
     assert len(results[0].fit.judged) == 0, "no round may follow, and no spot is set aside"
 
 
