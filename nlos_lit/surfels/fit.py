@@ -38,6 +38,7 @@ PLAIN = (
     "latest",
     "rival",
     "finer",
+    "priced",
     "area",
     "bend",
     "history",
@@ -79,8 +80,8 @@ class SurfelSettings:
             it for the logarithm of a prior.
         evenness: weight against albedos that differ between neighbours …
         brightness: … or are beyond the scene's own level (:meth:`SurfelModel.albedo_cost`).
-        lean: nats that each surfel costs that is there, however faint, from where sheets find their outlines;
-            divided ones cost as much together as they did.
+        lean: nats that each surfel costs that is there, however faint, while sheets find their outlines. In
+            rounds that follow surfels are fitted without, but their area must be worth as much.
         surfel_cost: nats that a surfel must be worth, see
             :func:`~nlos_lit.surfels.growth.prune_and_grow`.
         test_spots: random training spots on which scores are computed.
@@ -245,7 +246,8 @@ class SurfelFit:
         self.undo: dict[str, Any] | None = None  # what that began with
         self.latest = PLAN  # what came last of PLAN, DIVISION, ROUND and UNDONE
         self.rival: dict[str, Any] | None = None  # what dividing them again came to, until it is judged
-        self.area = math.inf  # m², of surfels when outlines are first found: what is as wide costs `lean`
+        self.priced = True  # no round was judged yet: surfels cost something while they are fitted
+        self.area = math.inf  # m², of surfels when a round is first judged: what is as wide costs `lean`
         self.finer = True  # surfels may be divided before one of them
         self.bend = BEND  # rad, by how much neighbours are taken to misfit
         self.history: list[dict[str, float]] = []
@@ -267,7 +269,7 @@ class SurfelFit:
         parts = (self.capture, self.grid, self.counts, self.train, self.settings, self.reserve)
         order = torch.randperm(len(self.train), generator=generator)
         other = SurfelFit(model, *parts, extension, generator, order, self.judged)
-        other.area = self.area
+        other.priced, other.area = self.priced, self.area
         return other
 
     def parts(self) -> dict[str, Any]:
@@ -386,13 +388,13 @@ class SurfelFit:
         """Say what is to be done next; it takes the place of what was.
 
         Last rounds of outlines are added while the fit is above the noise. Each must predict the judged spots
-        better by more than the standard error that patches of the wall leave of it, or is undone. Before the
-        first of them bodies are begun that are missing (:func:`~nlos_lit.surfels.growth.begin_bodies`), as
-        long as there are any and it helps. Before the others, since bright captures take longer to converge
-        and show finer detail, surfels are divided in four while they may be. To be divided once more must
-        predict better than a round without it, from the same surfels, in the same way; where it does not, it
-        waits until such rounds are undone. Where a division was undone surfels stay as they are, and where a
-        round without it was, too, none follows.
+        better by more than what surfels that it adds cost by their area and the standard error that patches
+        of the wall leave of it, or is undone. Before the first of them bodies are begun that are missing
+        (:func:`~nlos_lit.surfels.growth.begin_bodies`), as long as there are any and it helps. Before the
+        others, since bright captures take longer to converge and show finer detail, surfels are divided in
+        four while they may be. To be divided once more must predict better than a round without it, from the
+        same surfels, in the same way; where it does not, it waits until such rounds are undone. Where a
+        division was undone surfels stay as they are, and where a round without it was, too, none follows.
 
         Args:
             plan: the rounds.
@@ -456,7 +458,7 @@ class SurfelFit:
 
     def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any]) -> None:
         """A round of outlines, to go back to what it begins with unless it gains on ``nats``."""
-        self.before, self.undo = nats, begin
+        self.priced, self.before, self.undo = False, nats, begin
         self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
 
     def _begin_bodies(self) -> int:
@@ -530,7 +532,6 @@ class SurfelFit:
             self.model.set_opacity(unknown_opacity(self.model.albedo().detach()))
         self._hide(now.outline)
         if now.outline:
-            self.area = self._own_area() if self.area == math.inf else self.area
             before = self.model.albedo().detach()
             extend(self.model, self.grid, spots)
             solve_albedos(self.model, spots, counts, self._albedo_weights(), SEARCH, self.extension)
@@ -623,10 +624,7 @@ class SurfelFit:
     def _albedo_weights(self) -> tuple[float, float, float]:
         """Of what albedos cost in the present round."""
         s = self.settings
-        return s.evenness, s.brightness, s.lean * self._own_area() / self.area if self._outlined else 0.0
-
-    def _own_area(self) -> float:
-        return float(self.model.cell.prod())
+        return s.evenness, s.brightness, s.lean if self.priced and self._outlined else 0.0
 
     def step(self) -> None:
         """One batch."""
@@ -702,10 +700,15 @@ class SurfelFit:
 
     @torch.no_grad()
     def _predicted(self) -> tuple[Tensor, bool]:
-        """``[J]`` nats of the judged spots, and whether more than noise is left there."""
+        """``[J]`` nats of the judged spots, less their share of what surfels cost, by area; and whether more
+        than noise is left there.
+        """
         counts, expected, seen = _beside(self.model, self.capture, self.judged, self.extension)
         scores = transient_scores(counts, expected, seen)
         nats = (torch.xlogy(counts, expected.clamp_min(1e-9)) - expected).double().sum(1)
+        own = float(self.model.cell.prod())
+        self.area = own if self.area == math.inf else self.area
+        nats -= self.model.albedo_cost(0.0, 0.0, self.settings.lean * own / self.area) / len(self.train)
         return nats, scores.deviance_per_bin > scores.deviance_noise
 
     def _better(self, nats: Tensor, before: Tensor) -> bool:

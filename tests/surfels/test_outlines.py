@@ -367,32 +367,55 @@ def test_missing_bodies_come_first_while_there_are_any_and_they_help(monkeypatch
     assert began == seen
 
 
-def test_surfels_cost_as_much_as_their_area_from_outlines_on(monkeypatch):
-    """A copy, and a fit that is restored, know how wide those were that cost as much as any."""
+def test_surfels_cost_something_from_outlines_until_rounds_are_judged(monkeypatch):
+    """A copy, and a fit that is restored, know whether they still do."""
 
-    def cost(fit: SurfelFit) -> float:
-        """Nats: of a surfel as bright as the scene's level ``lean`` / 1.1."""
+    def costs(fit: SurfelFit) -> bool:
         found = []
         for lean in (0.0, 5.0):
             fit.settings = dataclasses.replace(fit.settings, lean=lean)
-            found.append(fit.loss(torch.arange(8))["albedos"].item() * len(fit.train) * fit.counts.shape[1])
-        return found[1] - found[0]
+            found.append(fit.loss(torch.arange(8))["albedos"].item())
+        return found[1] > found[0]
 
     fit = waiting()
-    fit.schedule([Round(1, grow=True)])
-    assert cost(fit) == 0
-    monkeypatch.setattr("nlos_lit.surfels.fit.extend", lambda *_: None)
-    monkeypatch.setattr("nlos_lit.surfels.fit.solve_albedos", lambda *_: None)
-    for parts in (1, 2):
-        fit.schedule([Round(1, parts=parts, outline=True)])
-        fit.begin_round()
-        assert len(fit.model) == 25 * parts**2
-        assert cost(fit) == pytest.approx(5 * 25 / 1.1, rel=1e-3)
+    for plan, told in (([Round(1, grow=True)], False), ([Round(1, outline=True)], True)):
+        fit.schedule(plan)
+        assert costs(fit) == told
+    fit.schedule([Round(1, onward=True)])
+    assert costs(fit)
+    monkeypatch.setattr(fit, "_predicted", lambda: (torch.zeros(4), True))
+    fit.schedule([], 1)
+    assert not costs(fit)
     other, again = fit.copy(fit.extension, 0), waiting()
     again.restore(fit.state())
     for each in (other, again):
         each.schedule([Round(1, onward=True)])
-        assert cost(each) == pytest.approx(5 * 25 / 1.1, rel=1e-3)
+        assert not costs(each)
+
+
+def test_what_a_round_adds_must_be_worth_its_area(monkeypatch):
+    """However finely it is divided; a copy, and a fit that is restored, know how wide surfels were."""
+
+    def cost(fit: SurfelFit) -> float:
+        """Nats, over all fitted spots: of a surfel as bright as the scene's level ``lean`` / 1.1."""
+        found = []
+        for lean in (0.0, 5.0):
+            fit.settings = dataclasses.replace(fit.settings, lean=lean)
+            found.append(fit._predicted()[0])
+        assert len(found[0]) == len(fit.judged)
+        return float((found[0] - found[1]).mean()) * len(fit.train)
+
+    fit = waiting()
+    assert cost(fit) == pytest.approx(5 * 25 / 1.1)
+    fit.model.divide(2)
+    other, again = fit.copy(fit.extension, 0), waiting()
+    again.restore(fit.state())
+    for each in (fit, other, again):
+        assert len(each.model) == 100
+        assert cost(each) == pytest.approx(5 * 25 / 1.1)
+    half = torch.cat([torch.ones(50), torch.zeros(50)])
+    fit.model.set_albedo(half)
+    assert cost(fit) == pytest.approx(5 * 12.5 / 1.1, rel=1e-3)
 
 
 @pytest.mark.parametrize("divided", [True, False])
