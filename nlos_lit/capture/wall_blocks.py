@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from torch import Tensor
 
 from nlos_lit.capture.capture import Capture
 
@@ -24,3 +25,24 @@ def wall_blocks(capture: Capture, number: int) -> np.ndarray:
     low, extent = xy.min(0), np.maximum(np.ptp(xy, axis=0), 1e-9)
     place = np.minimum((xy - low) / extent * number, number - 1e-6).astype(int)
     return place[:, 0] * number + place[:, 1]
+
+
+def by_block(values: Tensor, block: np.ndarray) -> np.ndarray:
+    """Sums over wall blocks.
+
+    Args:
+        values: ``[S, …]`` of spots.
+        block: ``[S]`` wall block of each.
+
+    Returns:
+        ``[B, …]`` in double precision, by rising block.
+
+    Examples:
+        >>> import torch
+        >>> by_block(torch.tensor([1.0, 2.0, 4.0]), np.array([7, 3, 7])).tolist()
+        [2.0, 5.0]
+    """
+    names, index = np.unique(block, return_inverse=True)
+    total = np.zeros((len(names), *values.shape[1:]))
+    np.add.at(total, index, values.numpy())
+    return total

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nlos_lit.capture import Capture
 from nlos_lit.capture.scan import Scan
+from nlos_lit.capture.wall_blocks import by_block
 from nlos_lit.effects import EFFECTS
 from nlos_lit.effects.effect import Effect
 from nlos_lit.effects.formulas import Formula
@@ -23,7 +24,7 @@ from nlos_lit.effects.strengths import bound_notes
 from nlos_lit.inference.advise import expected_nats
 from nlos_lit.inference.candidates import Candidate
 from nlos_lit.inference.distil import Follower, laid_through
-from nlos_lit.inference.heldout import Comparison, by_block, score
+from nlos_lit.inference.heldout import Comparison, score
 from nlos_lit.inference.members import Findings, Member, Trial
 from nlos_lit.inference.own import null_of
 from nlos_lit.inference.residuals import SIDE, profiles

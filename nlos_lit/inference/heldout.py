@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nlos_lit.capture.wall_blocks import by_block
 from nlos_lit.inference.per_spot import factors, neighbours, own_part, sparse, spot_scores
 from nlos_lit.metrics.transients import Scores
 from nlos_lit.surfels.fit import SurfelFit, score_spots
@@ -53,26 +54,6 @@ def log_likelihood(fit: SurfelFit, spots: np.ndarray) -> Tensor:
                 score, information = own_part(score, information, neighbours(fit.model, index))
             value += factors(score, information, effect.width, effect.share, sparse(effect))
     return value
-
-
-def by_block(values: Tensor, block: np.ndarray) -> np.ndarray:
-    """Sums over wall blocks.
-
-    Args:
-        values: ``[S, …]`` of spots.
-        block: ``[S]`` wall block of each.
-
-    Returns:
-        ``[B, …]`` in double precision, by rising block.
-
-    Examples:
-        >>> by_block(torch.tensor([1.0, 2.0, 4.0]), np.array([7, 3, 7])).tolist()
-        [2.0, 5.0]
-    """
-    names, index = np.unique(block, return_inverse=True)
-    total = np.zeros((len(names), *values.shape[1:]))
-    np.add.at(total, index, values.numpy())
-    return total
 
 
 def compare(before: Tensor, after: Tensor, block: np.ndarray, seed: int = 0) -> Comparison:

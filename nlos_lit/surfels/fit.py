@@ -15,7 +15,7 @@ from torch import Tensor
 from nlos_lit.capture import Capture
 from nlos_lit.capture.errors import UserError
 from nlos_lit.capture.volume_grid import VolumeGrid
-from nlos_lit.capture.wall_blocks import wall_blocks
+from nlos_lit.capture.wall_blocks import by_block, wall_blocks
 from nlos_lit.effects.extension import Extension
 from nlos_lit.effects.hooks import NOTHING, Hooks
 from nlos_lit.functional.surfel_graph import BEND, Sheet
@@ -708,7 +708,8 @@ class SurfelFit:
         nats = (torch.xlogy(counts, expected.clamp_min(1e-9)) - expected).double().sum(1)
         own = float(self.model.cell.prod())
         self.area = own if self.area == math.inf else self.area
-        nats -= self.model.albedo_cost(0.0, 0.0, self.settings.lean * own / self.area) / len(self.train)
+        cost = float(self.model.albedo_cost(0.0, 0.0, self.settings.lean * own / self.area))
+        nats -= cost / len(self.train)
         return nats, scores.deviance_per_bin > scores.deviance_noise
 
     def _better(self, nats: Tensor, before: Tensor) -> bool:
@@ -717,9 +718,8 @@ class SurfelFit:
         By patches, since neighbours err alike: what the model has wrong is smooth over the wall.
         """
         gain = nats - before
-        patch = torch.from_numpy(wall_blocks(self.capture, PATCHES))[self.judged.cpu()]
-        left = gain.new_zeros(PATCHES**2).index_add(0, patch, gain - gain.mean())
-        return float(gain.sum()) > float(left.norm())
+        patch = wall_blocks(self.capture, PATCHES)[self.judged.cpu()]
+        return float(gain.sum()) > float(np.linalg.norm(by_block(gain - gain.mean(), patch)))
 
 
 @torch.no_grad()
