@@ -48,6 +48,7 @@ PATCHES = 16  # along each side of the wall: spots are set aside, and their gain
 FINEST = 1.5  # bins: surfels no wider are not divided; light of neighbours arrives about a bin apart
 AGAIN = 25  # batches after which it is asked again how rough sheets are
 PLAN, DIVISION, ROUND, UNDONE = "plan", "division", "round without", "round undone"  # see schedule
+LAST = 4  # times as many batches as in other rounds: in the last of a plan, and in each that follows
 LOST = 0.01  # of the bright albedo: seeds below it have lost the contest
 
 
@@ -69,7 +70,7 @@ class SurfelSettings:
             those that move light in time.
         rounds: in which sheets are found; between them surfels die and grow one by one.
         outlines: rounds that follow, before which sheets are extended all around and cut back.
-        steps: batches a round; the last has twice as many.
+        steps: batches a round; the last has ``LAST`` times as many.
         more: last rounds that may follow, see :meth:`SurfelFit.schedule`.
         batch: spots a step.
         depth_rate: of Adam, in bins there and back.
@@ -102,7 +103,7 @@ class SurfelSettings:
     more: int = 8
     batch: int = 24
     depth_rate: float = 0.15
-    albedo_rate: float = 0.08
+    albedo_rate: float = 0.24
     opacity_rate: float = 0.2
     roll_rate: float = 0.05
     response_rate: float = 0.03
@@ -166,12 +167,12 @@ def plan_from_seeds(settings: SurfelSettings, parts: int, scan_shapes: bool) -> 
         scan_shapes: scanned parameters of effects are started after a first round of places.
 
     Returns:
-        the plan, whose last round is twice as long.
+        the plan, whose last round is ``LAST`` times as long.
 
     Examples:
         >>> plan = plan_from_seeds(SurfelSettings(rounds=2, outlines=1), 1, scan_shapes=False)
         >>> [(each.steps, each.left, each.grow, each.outline) for each in plan]
-        [(150, 3, False, False), (100, 2, False, False), (100, 1, True, False), (200, 0, False, True)]
+        [(150, 3, False, False), (100, 2, False, False), (100, 1, True, False), (400, 0, False, True)]
     """
     s = settings
     plan = [Round(s.contest, settling=True, contest=True)] if s.contest else []
@@ -179,7 +180,7 @@ def plan_from_seeds(settings: SurfelSettings, parts: int, scan_shapes: bool) -> 
     coarse = max(s.rounds, 2) if scan_shapes else s.rounds
     plan += [Round(s.steps, grow=True, shapes=scan_shapes and k == 0) for k in range(coarse - 1)]
     plan += [Round(s.steps, outline=True)] * s.outlines
-    plan[-1] = replace(plan[-1], steps=2 * s.steps)
+    plan[-1] = replace(plan[-1], steps=LAST * s.steps)
     return [replace(each, left=len(plan) - 1 - k) for k, each in enumerate(plan)]
 
 
@@ -459,7 +460,7 @@ class SurfelFit:
     def _plan_one(self, parts: int, nats: Tensor, begin: dict[str, Any]) -> None:
         """A round of outlines, to go back to what it begins with unless it gains on ``nats``."""
         self.priced, self.before, self.undo = False, nats, begin
-        self.plan = [Round(2 * self.settings.steps, parts=parts, outline=True)]
+        self.plan = [Round(LAST * self.settings.steps, parts=parts, outline=True)]
 
     def _begin_bodies(self) -> int:
         return begin_bodies(self.model, self.grid, self._place_test(), self.reserve)

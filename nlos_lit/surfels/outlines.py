@@ -26,7 +26,8 @@ from nlos_lit.surfels.model import SurfelModel
 RINGS = 2  # cells by which sheets are extended at a time
 SOURCE = 0.1  # of the mean albedo: fainter surfels are not extended
 BEGIN = 0.5  # of the sheet's albedo, where the search for a new surfel's begins
-DIM = 0.1  # of the scene's level: fainter surfels are not there
+DIM = 0.1  # of the scene's level: fainter surfels are not there …
+OPAQUE = 0.5  # … unless they hide more than this, which is what is taken of any until the counts say more
 SEARCH, MEND = 30, 10  # iterations, among all candidates and when the others are gone
 CHUNK = 1 << 20  # paths at a time
 
@@ -152,10 +153,11 @@ def solve_albedos(
 
 @torch.no_grad()
 def cut_back(model: SurfelModel, before: Tensor) -> None:
-    """Leave out surfels fainter than ``DIM`` of the scene's level.
+    """Leave out surfels fainter than ``DIM`` of the scene's level that hide nothing.
 
-    What was brighter before its neighbours were extended stays: it hides what is behind it, and its light may
-    have gone to new ones beside it, which are too faint to stay themselves.
+    What was brighter before its neighbours were extended stays: its light may have gone to new ones beside
+    it, which are too faint to stay themselves. So does what is opaque by what the counts say: a dark stripe
+    sends next to nothing and stands before what is behind it all the same.
 
     Args:
         model: of the surfels.
@@ -163,7 +165,7 @@ def cut_back(model: SurfelModel, before: Tensor) -> None:
     """
     albedo = model.albedo()
     kept, old = albedo > DIM * level_of(albedo), len(before)
-    kept[:old] |= before > DIM * level_of(before)
+    kept[:old] |= (before > DIM * level_of(before)) | (model.opacity()[:old] > OPAQUE)
     known, curvature = model.opacity()[:old][kept[:old]], model.curvature[kept]
     centre, normal = (part[kept] for part in model.placed())
     model.place(centre, normal, albedo[kept], known, curvature)

@@ -19,7 +19,7 @@ from nlos_lit.functional.surfel_lattice import side
 from nlos_lit.functional.surfel_paths import STEEP
 from nlos_lit.surfels.fit import FINEST, Round, SurfelFit, SurfelSettings, score_spots
 from nlos_lit.surfels.model import SurfelModel
-from nlos_lit.surfels.outlines import DIM, RINGS, SEARCH, cut_back, extend, solve_albedos
+from nlos_lit.surfels.outlines import DIM, OPAQUE, RINGS, SEARCH, cut_back, extend, solve_albedos
 
 pytestmark = FORWARD_MODE
 CELL = 0.08
@@ -247,16 +247,23 @@ def test_faint_surfels_are_not_extended():
 
 
 @pytest.mark.parametrize(
-    ("before", "share", "stays"),
-    [(0.95, 0.95, False), (0.95, 1.05, True), (1.05, 0.95, True), (None, 0.95, False), (None, 1.05, True)],
+    ("before", "share", "hides", "stays"),
+    [
+        (0.95, 0.95, 0.95, False),
+        (0.95, 1.05, 0.95, True),
+        (1.05, 0.95, 0.95, True),
+        (0.95, 0.95, 1.05, True),
+        (None, 0.95, 1.05, False),
+        (None, 1.05, 0.95, True),
+    ],
 )
-def test_surfels_go_that_are_dim_and_were_dim_or_new(before, share, stays):
+def test_surfels_go_that_are_dim_and_were_dim_or_new_and_hide_nothing(before, share, hides, stays):
     albedo = torch.ones(3, 3)
     albedo[2, 2] = share * DIM
     model = board(albedo)
     assert level_of(model.albedo()).item() == pytest.approx(1.0, rel=1e-5)
     known = torch.ones(8) if before is None else torch.tensor([1.0] * 8 + [before * DIM])
-    model.set_opacity(torch.full((9,), 0.8))
+    model.set_opacity(torch.tensor([0.8] * 8 + [hides * OPAQUE]))
     cut_back(model, known)
     assert len(model) == (9 if stays else 8)
     # Those that were there keep their opacity, of a new one nothing is known.
