@@ -152,8 +152,8 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
         if fit.round_done:
             fit.end_round()
     first, last = np.array(rates[:4]), np.array(rates[4:])
-    waiting = [0.08, 0.1, 0.15, 0.2, 0.3 * 0.03]  # the response, and how far rims roll off
-    highest = [0.08, 0.1, 0.15, 0.2, 0.05, 0.03]
+    waiting = [0.24, 0.1, 0.15, 0.2, 0.3 * 0.03]  # the response, and how far rims roll off
+    highest = [0.24, 0.1, 0.15, 0.2, 0.05, 0.03]
     assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, waiting))
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 
@@ -199,12 +199,12 @@ def test_a_plan_is_the_rounds_in_order():
         Round(10, left=3, settling=True, parts=2),
         Round(10, left=2, grow=True),
         Round(10, left=1, outline=True),
-        Round(20, outline=True),
+        Round(40, outline=True),
     ]
     bare = dataclasses.replace(settings, outlines=0, contest=0)
     assert plan_from_seeds(bare, 1, scan_shapes=True) == [
         Round(10, left=1, settling=True),
-        Round(20, grow=True, shapes=True),
+        Round(40, grow=True, shapes=True),
     ]
     assert len(plan_from_seeds(dataclasses.replace(bare, rounds=1), 1, scan_shapes=True)) == 2
 

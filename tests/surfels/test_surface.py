@@ -154,7 +154,7 @@ def test_same_seed_same_result_and_held_out_counts_do_not_matter(fitted):
 def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitted):
     capture, held, intensity, grid, _ = fitted
     train = np.flatnonzero(~held)
-    short = dataclasses.replace(QUICK, contest=0, rounds=1, outlines=0, steps=15)
+    short = dataclasses.replace(QUICK, contest=0, rounds=1, outlines=0, steps=2)
     seen, deviances, results = [], [], []
     for more in (0, 1, 3):
         settings = dataclasses.replace(short, more=more)
@@ -165,8 +165,8 @@ def test_more_rounds_follow_while_they_gain_and_the_fit_is_above_the_noise(fitte
     assert [len(result.history) for result in results] == [1, 3, 5], "one looked for bodies"
     assert deviances[0] > deviances[1] > deviances[2]
     of = dict(seen)
-    assert [k for k, _ in seen] == list(range(1, 91))
-    assert [of[k] for k in (30, 31, 60, 61, 90)] == [30, 60, 60, 90, 90]
+    assert [k for k, _ in seen] == list(range(1, 25))
+    assert [of[k] for k in (8, 9, 16, 17, 24)] == [8, 16, 16, 24, 24]
     given = results[-1].fit
     judged, train_of_it = set(given.judged.tolist()), set(given.train.tolist())
     assert len(judged) == len(train) // 10
@@ -229,7 +229,7 @@ def test_effects_are_fitted_along_and_their_shapes_found(fitted):
         assert (abs(ripple["period"] - 11.3) < 0.3) == scan_shapes
     assert ripple["rms"] == pytest.approx(0.2 / 2**0.5, abs=0.03 / 2**0.5)
     assert scores[True] < scores[False] - 0.02
-    assert seen[440:] == [(k, 440) for k in range(1, 441)]
+    assert seen[640:] == [(k, 640) for k in range(1, 641)]
 
 
 def test_a_decay_is_found_and_an_absent_effect_stays_at_its_null(fitted):
@@ -310,7 +310,7 @@ def test_progress_counts_every_step(fitted):
         np.flatnonzero(~held),
         progress=lambda done, total: seen.append((done, total)),
     )
-    assert seen == [(k, 15) for k in range(1, 16)]
+    assert seen == [(k, 21) for k in range(1, 22)]
 
 
 @pytest.mark.parametrize("ambient", [0.3, 40.0])
@@ -567,18 +567,23 @@ def outside(result: FittedSurfels) -> float:
 
 
 def test_outlines_are_where_the_plates_end(fitted):
-    """All together, and finer where that predicts more, against as many rounds one by one."""
+    """All together, and finer where that predicts more, against as many rounds one by one; of two seeds."""
     capture, held, intensity, grid, result = fitted
     train, scored = np.flatnonzero(~held), np.flatnonzero(held)
     together, one_by_one = (
-        fit_surfels(capture, intensity, grid, settings, train, seed=0, heldout_spots=scored)
+        np.mean(
+            [
+                outside(fit_surfels(capture, intensity, grid, settings, train, seed=s, heldout_spots=scored))
+                for s in (0, 1)
+            ]
+        )
         for settings in (
             dataclasses.replace(QUICK, rounds=2, outlines=2, more=2),
             dataclasses.replace(QUICK, rounds=6, outlines=0),
         )
     )
-    assert outside(result) < outside(one_by_one)
-    assert outside(together) < outside(one_by_one)
+    assert outside(result) < one_by_one
+    assert together < one_by_one
 
 
 def test_normals_follow_places_while_a_sheet_is_laid(fitted):
@@ -772,7 +777,7 @@ def test_the_counts_say_how_much_dark_surfels_hide(fitted, opacity):
     model.set_opacity(torch.full((len(model),), opacity))
     fit.counts = model.expected(fit.train)
     model.set_opacity(torch.full((len(model),), 0.5))
-    fit.schedule([Round(60, onward=True)])
+    fit.schedule([Round(120, onward=True)])
     fit.finish()
     found = fit.model.opacity()[hiding > 0.5 * hiding.max()]
     assert len(found) > 3

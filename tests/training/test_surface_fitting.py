@@ -252,7 +252,7 @@ def test_the_door_leaves_a_surface(finished):
     refined, heldout = summary["refined"], summary["heldout"]
     assert heldout["nmse"]["final"] < heldout["nmse"]["initial"]
     assert refined["heldout"]["nmse"] == pytest.approx(heldout["nmse"]["final"], rel=1e-3)
-    assert summary["iterations"] == 4 + 8 + 16 + 8 + 16 + 16  # the last is an added one
+    assert summary["iterations"] == 4 + 8 + 32 + 8 + 32 + 32  # the last is an added one
     assert {"sigma_ls", "irf_tail.fraction", "power_drift.rms"} <= set(summary["parameters"])
     place = finished / "refined"
     assert {path.name for path in place.iterdir()} >= {
@@ -276,10 +276,10 @@ def test_events_hold_the_way_of_the_surface(finished):
         "loss/total", "loss/counts", "loss/bending", "deviance", "surfels", "heldout/deviance_per_bin",
         "parameters/sigma_ls", "parameters/irf_tail.fraction",
     } <= set(tags["scalars"])  # fmt: skip
-    assert len(events.Scalars("deviance")) == 52 + 16
+    assert len(events.Scalars("deviance")) == 84 + 32
     assert events.Scalars("deviance")[-1].value < events.Scalars("deviance")[0].value
     assert {"overview", "surface", "transients", "laser_sensor"} <= set(tags["images"])
-    assert len(events.Images("overview")) == 5  # at the start, after 20, 40 and 60, at the end
+    assert len(events.Images("overview")) == 7  # at the start, after 20, 40, 60, 80 and 100, at the end
 
 
 CTRL_C = """
