@@ -103,7 +103,7 @@ class SurfelSettings:
     more: int = 8
     batch: int = 24
     depth_rate: float = 0.15
-    albedo_rate: float = 0.24
+    albedo_rate: float = 0.08
     opacity_rate: float = 0.2
     roll_rate: float = 0.05
     response_rate: float = 0.03

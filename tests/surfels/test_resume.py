@@ -152,8 +152,8 @@ def test_rates_fall_within_a_round_and_the_last_cools_down():
         if fit.round_done:
             fit.end_round()
     first, last = np.array(rates[:4]), np.array(rates[4:])
-    waiting = [0.24, 0.1, 0.15, 0.2, 0.3 * 0.03]  # the response, and how far rims roll off
-    highest = [0.24, 0.1, 0.15, 0.2, 0.05, 0.03]
+    waiting = [0.08, 0.1, 0.15, 0.2, 0.3 * 0.03]  # the response, and how far rims roll off
+    highest = [0.08, 0.1, 0.15, 0.2, 0.05, 0.03]
     assert first == pytest.approx(np.outer(1 - 0.7 * np.arange(4) / 4, waiting))
     assert last == pytest.approx(np.outer(0.5 * (1 + np.cos(np.pi * np.arange(8) / 8)), highest))
 

@@ -777,7 +777,7 @@ def test_the_counts_say_how_much_dark_surfels_hide(fitted, opacity):
     model.set_opacity(torch.full((len(model),), opacity))
     fit.counts = model.expected(fit.train)
     model.set_opacity(torch.full((len(model),), 0.5))
-    fit.schedule([Round(120, onward=True)])
+    fit.schedule([Round(60, onward=True)])
     fit.finish()
     found = fit.model.opacity()[hiding > 0.5 * hiding.max()]
     assert len(found) > 3
