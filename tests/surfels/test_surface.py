@@ -567,23 +567,18 @@ def outside(result: FittedSurfels) -> float:
 
 
 def test_outlines_are_where_the_plates_end(fitted):
-    """All together, and finer where that predicts more, against as many rounds one by one; of two seeds."""
+    """All together, and finer where that predicts more, against as many rounds one by one."""
     capture, held, intensity, grid, result = fitted
     train, scored = np.flatnonzero(~held), np.flatnonzero(held)
     together, one_by_one = (
-        np.mean(
-            [
-                outside(fit_surfels(capture, intensity, grid, settings, train, seed=s, heldout_spots=scored))
-                for s in (0, 1)
-            ]
-        )
+        fit_surfels(capture, intensity, grid, settings, train, seed=0, heldout_spots=scored)
         for settings in (
             dataclasses.replace(QUICK, rounds=2, outlines=2, more=2),
             dataclasses.replace(QUICK, rounds=6, outlines=0),
         )
     )
-    assert outside(result) < one_by_one
-    assert together < one_by_one
+    assert outside(result) < outside(one_by_one)
+    assert outside(together) < outside(one_by_one)
 
 
 def test_normals_follow_places_while_a_sheet_is_laid(fitted):
