@@ -39,6 +39,7 @@ def check(outcome: Outcome) -> None:
         assert outcome.gain > 25
 
 
+@pytest.mark.slow
 def test_nothing_hidden_nothing_named():
     outcome = run_case(Spec("letters", level=1500, seed=12), QUICK, oracle=False)
     check(outcome)
