@@ -65,7 +65,7 @@ def finished(tmp_path_factory) -> Path:
         "scene.iterations=6",
         "effects=[wall_reflectance,irf_tail]",
         "surfels.rounds=2",
-        "surfels.steps=16",
+        "surfels.steps=5",
         "surfels.contest=8",
         "surfels.more=0",
         EACH,
